@@ -1,0 +1,54 @@
+"""Wave energy in disordered granular chains: exact ensembles and the master equation calibrated from them.
+
+Names are loaded on first use, so that the command line answers before torch is imported.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_HOME = {
+    "Chain": "chain",
+    "Disorder": "disorder",
+    "Impulse": "excitation",
+    "NormalModes": "spectrum",
+    "Scene": "scene",
+    "StandingWave": "excitation",
+    "State": "excitation",
+    "Trajectory": "evolvers",
+    "METHODS": "evolvers",
+    "band_energy": "wavenumber",
+    "basis_fraction": "wavenumber",
+    "bin_energy": "wavenumber",
+    "energy_center": "energy",
+    "energy_matrices": "energy",
+    "energy_width": "energy",
+    "evolve": "evolvers",
+    "impulse": "excitation",
+    "kinetic_energy": "energy",
+    "long_time_band_energy": "wavenumber",
+    "normal_modes": "spectrum",
+    "particle_energy": "energy",
+    "potential_energy": "energy",
+    "standing_wave": "excitation",
+    "total_energy": "energy",
+    "wavenumber_energy": "wavenumber",
+    "wavenumber_energy_matrix": "wavenumber",
+    "zero_wavenumber_share": "wavenumber",
+}
+
+__all__ = sorted(_HOME)
+__version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'torchchain' has no attribute '{name}'")
+    value = getattr(import_module(f"torchchain.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

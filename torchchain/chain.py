@@ -1,0 +1,199 @@
+"""The granular chain: masses, contacts and boundary, with its contact law (Eqs. 6-13)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+
+BOUNDARIES = ("periodic", "fixed")
+CONTACTS = ("linear", "hertz")
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Chains of beads, each in contact with its two neighbors; a batch shares boundary and contact law.
+
+    Units: mean mass 1, contact stiffness 1, initial overlap 1, so that sound travels one particle per unit time.
+
+    Contact c (counted from 0) joins particles c - 1 and c. A fixed chain of N particles has N + 1 contacts, the
+    first and the last with a wall; a periodic one has N, contact 0 joining the last particle to the first.
+
+    The Hertz contact force is (2/3) kappa (1 - e)^(3/2) for the elongation e < 1 and zero for an open contact,
+    e >= 1: its slope at e = 0 is the linear contact's kappa, where Eq. 7 as printed would have (3/2) kappa and
+    times shorter by sqrt(3/2).
+
+    Attributes:
+        masses: (*batch, particle), positive.
+        boundary: "periodic" or "fixed".
+        stiffness: kappa, a number or a tensor (contact,) or (*batch, contact), positive.
+        contact: "linear" (Eq. 12) or "hertz" (Eq. 7).
+        damping: contact damping force per relative velocity (Eq. 14), like ``stiffness`` but zero allowed.
+
+    Raises:
+        FieldError, FieldTypeError: for a value out of range, naming its realization and particle.
+    """
+
+    masses: Tensor
+    boundary: str = "periodic"
+    stiffness: float | Tensor = 1.0
+    contact: str = "linear"
+    damping: float | Tensor = 0.0
+
+    def __post_init__(self) -> None:
+        masses = checks.real_tensor("masses", self.masses)
+        if masses.ndim == 0 or masses.shape[-1] < 2:
+            raise checks.fail("masses", "hold at least 2 particles on the last axis", f"shape {tuple(masses.shape)}")
+        checks.first_bad("masses", "be positive", masses, masses <= 0, "particle")
+        checks.choice("boundary", self.boundary, BOUNDARIES)
+        checks.choice("contact", self.contact, CONTACTS)
+        object.__setattr__(self, "masses", masses)
+        object.__setattr__(self, "stiffness", self._per_contact("stiffness", self.stiffness, zero=False))
+        object.__setattr__(self, "damping", self._per_contact("damping", self.damping, zero=True))
+
+    def _per_contact(self, field: str, value: float | Tensor, zero: bool) -> Tensor:
+        """The value as a tensor (contact,) or (*batch, contact), like the masses in dtype and device."""
+        value = checks.real_tensor(field, value).to(self.masses)
+        rule = "not be negative" if zero else "be positive"
+        checks.first_bad(field, rule, value, value < 0 if zero else value <= 0, "contact")
+        shape = (*self.batch_shape, self.n_contacts)
+        if value.ndim == 0:
+            return value.expand(self.n_contacts)
+        if tuple(value.shape) not in (shape, shape[-1:]):
+            raise checks.fail(
+                field, f"be a number or have shape {shape[-1:]} or {shape}", f"shape {tuple(value.shape)}"
+            )
+        return value
+
+    @property
+    def n_particles(self) -> int:
+        return self.masses.shape[-1]
+
+    @property
+    def n_contacts(self) -> int:
+        return self.n_particles + (self.boundary == "fixed")
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        return self.masses.shape[:-1]
+
+    @property
+    def is_damped(self) -> bool:
+        return bool((self.damping > 0).any())
+
+    @property
+    def is_uniform_ring(self) -> bool:
+        """Periodic, with equal linear contacts: the stiffness is diagonal in wavenumber space."""
+        return (
+            self.boundary == "periodic"
+            and self.contact == "linear"
+            and bool((self.stiffness == self.stiffness.flatten()[0]).all())
+        )
+
+    def align(self, values: Tensor, field: Tensor) -> Tensor:
+        """``values`` (*batch, x) shaped to multiply a ``field`` (*batch, *any, x) of states of these chains."""
+        batch = len(self.batch_shape)
+        if field.shape[:batch] != self.batch_shape or field.ndim <= batch:
+            raise checks.fail(
+                "state",
+                f"have leading axes {tuple(self.batch_shape)} like the chain's masses",
+                f"shape {tuple(field.shape)}",
+            )
+        if values.ndim == 1:
+            return values
+        return values.reshape(*self.batch_shape, *[1] * (field.ndim - batch - 1), values.shape[-1])
+
+    def elongation(self, displacement: Tensor) -> Tensor:
+        """Change of length of every contact, (*batch, *any, contact): right minus left displacement, walls at 0."""
+        if self.boundary == "periodic":
+            return displacement - displacement.roll(1, -1)
+        return torch.nn.functional.pad(displacement, (1, 1)).diff(dim=-1)
+
+    def net(self, tension: Tensor) -> Tensor:
+        """Force on every particle, (*batch, *any, particle): tension of its right contact minus that of its left."""
+        if self.boundary == "periodic":
+            return tension.roll(-1, -1) - tension
+        return tension.diff(dim=-1)
+
+    def tension(self, elongation: Tensor) -> Tensor:
+        """Pull of every contact relative to the precompressed state, (*batch, *any, contact)."""
+        stiffness = self.align(self.stiffness, elongation)
+        if self.contact == "linear":
+            return stiffness * elongation
+        # (2/3) (1 - (1 - e)^(3/2)) without cancellation: with s = sqrt(1 - e) and q = 1 - s, 1 - s^3 = q (3 - 3 q + q^2).
+        q = _hertz_variable(elongation)
+        return stiffness * (2 / 3) * q * (3 - 3 * q + q * q)
+
+    def force(self, displacement: Tensor) -> Tensor:
+        """Contact force on every particle, K u for linear contacts (Eqs. 7, 13), (*batch, *any, particle)."""
+        return self.net(self.tension(self.elongation(displacement)))
+
+    def damping_force(self, velocity: Tensor) -> Tensor:
+        """Damping force -D v on every particle (Eq. 14), (*batch, *any, particle)."""
+        rate = self.elongation(velocity)
+        return self.net(self.align(self.damping, rate) * rate)
+
+    def contact_energy(self, displacement: Tensor) -> Tensor:
+        """Potential energy of every contact relative to the precompressed state, (*batch, *any, contact), never negative."""
+        elongation = self.elongation(displacement)
+        stiffness = self.align(self.stiffness, elongation)
+        if self.contact == "linear":
+            return stiffness * elongation.square() / 2
+        # (2/3) [e - (2/5) (1 - (1 - e)^(5/2))] as a polynomial in q; an open contact adds (2/3) per unit length.
+        q = _hertz_variable(elongation)
+        closed = q * q * (3 - 4 * q + 2 * q * q - 0.4 * q**3)
+        return stiffness * (2 / 3) * (closed + (elongation - 1).clamp(min=0))
+
+    def open_contacts(self, displacement: Tensor) -> Tensor:
+        """Whether each contact is open (the elongation has used up the initial overlap 1), (*batch, *any, contact)."""
+        return self.elongation(displacement) >= 1
+
+    def stiffness_matrix(self) -> Tensor:
+        """K of Eq. 13, symmetric and negative semidefinite, (*batch, particle, particle)."""
+        n = self.n_particles
+        stiffness = self.stiffness.expand(*self.batch_shape, self.n_contacts)
+        left = stiffness if self.boundary == "periodic" else stiffness[..., :-1]
+        right = stiffness.roll(-1, -1) if self.boundary == "periodic" else stiffness[..., 1:]
+        matrix = torch.diag_embed(-(left + right))
+        i = torch.arange(n - 1, device=matrix.device)
+        inner = left[..., 1:]
+        matrix[..., i, i + 1] = inner
+        matrix[..., i + 1, i] = inner
+        if self.boundary == "periodic":  # added, not set: two particles share both contacts
+            matrix[..., 0, n - 1] += stiffness[..., 0]
+            matrix[..., n - 1, 0] += stiffness[..., 0]
+        return matrix
+
+    def squared_frequency_bound(self, sweeps: int = 30) -> Tensor:
+        """A rigorous upper bound on every squared frequency of the linear chain, (*batch,).
+
+        The largest eigenvalue of A = -M^-1 K is at most that of |A|, and for a non-negative matrix max (|A| x) / x
+        over the particles bounds it from above for any positive x (Collatz and Wielandt). Some power steps make x
+        a good one; the bound holds after any number of them. Two ulps cover the rounding.
+        """
+        stiffness = self.stiffness.expand(*self.batch_shape, self.n_contacts)
+        x = torch.ones_like(self.masses)
+        ratio = x
+        for _ in range(sweeps + 1):
+            if self.boundary == "periodic":
+                sums = stiffness * (x + x.roll(1, -1))
+                image = (sums + sums.roll(-1, -1)) / self.masses
+            else:
+                padded = torch.nn.functional.pad(x, (1, 1))
+                sums = stiffness * (padded[..., 1:] + padded[..., :-1])
+                image = (sums[..., 1:] + sums[..., :-1]) / self.masses
+            ratio = image / x
+            # The geometric mean of x and its image stays positive and does not alternate between neighbors.
+            x = (x * image).sqrt()
+            x = x / x.amax(-1, keepdim=True)
+            x = x.clamp(min=torch.finfo(x.dtype).tiny ** 0.25)
+        return ratio.amax(-1) * (1 + 8 * torch.finfo(x.dtype).eps)
+
+
+def _hertz_variable(elongation: Tensor) -> Tensor:
+    """q = 1 - sqrt(1 - e) = e / (1 + sqrt(1 - e)); 1 for an open contact."""
+    closed = elongation.clamp(max=1)
+    return closed / (1 + (1 - closed).sqrt())

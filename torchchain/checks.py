@@ -1,0 +1,137 @@
+"""One validator per concept; every error names the field, the rule and the value."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class FieldError(ValueError):
+    """A value that breaks a rule: the message reads ``field must rule, got value``."""
+
+
+class FieldTypeError(TypeError):
+    """A value of the wrong type, worded like :class:`FieldError`."""
+
+
+def shown(value: Any, width: int = 80) -> str:
+    """The value as one short line, for an error message."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= width else text[: width - 3] + "..."
+
+
+def fail(field: str, rule: str, value: Any) -> FieldError:
+    """The error for a ``field`` whose ``value`` breaks the ``rule``, to be raised by the caller."""
+    return FieldError(f"{field} must {rule}, got {value if isinstance(value, str) else shown(value)}")
+
+
+def integer(field: str, value: Any, minimum: int | None = None, maximum: int | None = None) -> int:
+    """The value as an int within [minimum, maximum]; a bool or a fraction is an error."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        if not (isinstance(value, float) and value.is_integer()):
+            raise FieldTypeError(f"{field} must be an integer, got {shown(value)}")
+    value = int(value)
+    if minimum is not None and value < minimum:
+        raise fail(field, f"be at least {minimum}", value)
+    if maximum is not None and value > maximum:
+        raise fail(field, f"be at most {maximum}", value)
+    return value
+
+
+def number(
+    field: str,
+    value: Any,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+    at_most: float | None = None,
+) -> float:
+    """The value as a finite float within the bounds given."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise FieldTypeError(f"{field} must be a number, got {shown(value)}")
+    try:
+        value = float(value)
+    except OverflowError:
+        raise fail(field, "be finite", value) from None
+    if not math.isfinite(value):
+        raise fail(field, "be finite", value)
+    if above is not None and not value > above:
+        raise fail(field, f"be greater than {above:g}", value)
+    if at_least is not None and not value >= at_least:
+        raise fail(field, f"be at least {at_least:g}", value)
+    if below is not None and not value < below:
+        raise fail(field, f"be less than {below:g}", value)
+    if at_most is not None and not value <= at_most:
+        raise fail(field, f"be at most {at_most:g}", value)
+    return value
+
+
+def choice(field: str, value: Any, choices: Iterable[str]) -> str:
+    """The value, if it is one of the choices."""
+    choices = tuple(choices)
+    if not isinstance(value, str):
+        raise FieldTypeError(f"{field} must be a string, one of {', '.join(choices)}, got {shown(value)}")
+    if value not in choices:
+        raise fail(field, f"be one of {', '.join(choices)}", repr(value))
+    return value
+
+
+def known_keys(field: str, given: Iterable[str], allowed: Iterable[str]) -> None:
+    """An error that names the first key that is not allowed."""
+    allowed = tuple(allowed)
+    for key in given:
+        if key not in allowed:
+            raise fail(field, f"have only the keys {', '.join(allowed) or '(none)'}", repr(key))
+
+
+def real_tensor(field: str, value: Any) -> Tensor:
+    """The value as a finite tensor of real floating-point numbers (float64 unless it is a tensor)."""
+    if not isinstance(value, Tensor):
+        try:
+            value = torch.as_tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            raise FieldTypeError(f"{field} must be real numbers, got {shown(value)}") from None
+    if not value.is_floating_point():
+        if value.is_complex() or value.dtype == torch.bool:
+            raise FieldTypeError(f"{field} must be real floating-point numbers, got dtype {value.dtype}")
+        value = value.to(torch.float64)
+    first_bad(field, "be finite", value, ~torch.isfinite(value))
+    return value
+
+
+def first_bad(field: str, rule: str, values: Tensor, bad: Tensor, axis: str = "position") -> None:
+    """An error that names the first entry of ``values`` where ``bad`` holds: ``at realization 2, particle 17``."""
+    if not bool(bad.any()):
+        return
+    where = tuple(int(i) for i in bad.nonzero()[0])
+    raise fail(field, rule, f"{values[where].item():.6g}{position(where, axis)}")
+
+
+def position(index: tuple[int, ...], axis: str | None = None) -> str:
+    """A tensor index as words counted from 1: leading axes are the realization, the last is ``axis`` if one is named."""
+    if not index:
+        return ""
+    batch = index if axis is None else index[:-1]
+    words = [f"realization {', '.join(str(i + 1) for i in batch)}"] if batch else []
+    return " at " + ", ".join(words + ([] if axis is None else [f"{axis} {index[-1] + 1}"]))
+
+
+def times(field: str, value: Any) -> Tensor:
+    """Output times: one-dimensional, finite, not negative, strictly increasing, at least one."""
+    value = real_tensor(field, value)
+    if value.ndim != 1:
+        raise fail(field, "be one-dimensional", f"shape {tuple(value.shape)}")
+    if len(value) == 0:
+        raise fail(field, "hold at least one time", "none")
+    first_bad(field, "not be negative", value, value < 0)
+    steps = value.diff()
+    if bool((steps <= 0).any()):
+        i = int((steps <= 0).nonzero()[0])
+        raise fail(field, "increase strictly", f"{value[i].item():g} then {value[i + 1].item():g} at position {i + 2}")
+    return value

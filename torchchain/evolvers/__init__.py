@@ -1,0 +1,57 @@
+"""Ways to evolve a chain in time, one method a file, one registry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import Chain
+from torchchain.evolvers import modes
+from torchchain.evolvers.method import Advance, Method, Trajectory
+from torchchain.excitation import State
+
+METHODS: dict[str, Method] = {entry.name: entry for entry in (modes.METHOD,)}
+
+__all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "start"]
+
+
+def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:
+    """States of the chain at the given times.
+
+    Args:
+        chain: masses (*batch, particle).
+        state: the start at time 0, (*batch, *any, particle).
+        times: (time,), in units of the travel time of sound over one particle; increasing, not negative.
+        method: a name in ``METHODS``; each entry states its order, stability, cost and limits.
+        options: the method's own.
+
+    Returns:
+        Trajectory with displacement and velocity (*batch, *any, time, particle).
+
+    Raises:
+        FieldError, FieldTypeError: for times, a method, an option or a chain that the method cannot treat.
+    """
+    return start(chain, state, method, **options)(checks.times("times", times).to(state.displacement.device))
+
+
+def start(chain: Chain, state: State, method: str, **options: Any) -> Advance:
+    """The start of an evolution whose times come in windows; see :class:`Method`."""
+    entry = METHODS[checks.choice("method", method, METHODS)]
+    checks.known_keys(f"options of method '{method}'", options, entry.options)
+    n = chain.n_particles
+    if state.displacement.shape[-1] != n:
+        raise checks.fail("state", f"have {n} particles like the chain", f"shape {tuple(state.displacement.shape)}")
+    chain.align(chain.masses, state.displacement)
+    if chain.boundary not in entry.boundaries:
+        raise checks.fail("boundary", f"be {' or '.join(entry.boundaries)} for method '{method}'", repr(chain.boundary))
+    if chain.contact not in entry.contacts:
+        raise checks.fail("contact", f"be {' or '.join(entry.contacts)} for method '{method}'", repr(chain.contact))
+    if chain.is_damped and not entry.damped:
+        raise checks.fail(
+            "damping",
+            f"be zero for method '{method}' (methods with damping: {', '.join(name for name, m in METHODS.items() if m.damped)})",
+            f"up to {chain.damping.max().item():g}",
+        )
+    return entry.start(chain, state, **options)

@@ -1,0 +1,156 @@
+"""Initial states: impulse (Eq. 22) and standing wave (Section 2.6)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import Chain
+
+PHASES = ("sin", "cos")
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Displacement and velocity of every particle at one instant, each (*batch, *any, particle)."""
+
+    displacement: Tensor
+    velocity: Tensor
+
+    def __post_init__(self) -> None:
+        for field in ("displacement", "velocity"):
+            object.__setattr__(self, field, checks.real_tensor(field, getattr(self, field)))
+        if self.displacement.shape != self.velocity.shape:
+            raise checks.fail(
+                "velocity",
+                f"have the displacement's shape {tuple(self.displacement.shape)}",
+                f"shape {tuple(self.velocity.shape)}",
+            )
+
+    def __add__(self, other: State) -> State:
+        """The superposition of two states."""
+        return State(self.displacement + other.displacement, self.velocity + other.velocity)
+
+
+def impulse(chain: Chain, site: int = 1, velocity: float = 0.01) -> State:
+    """One particle is given a velocity, all else is at rest (Eq. 22).
+
+    Args:
+        chain: masses (*batch, particle).
+        site: the particle, counted from 1.
+        velocity: in sound speeds of the ordered chain times the initial overlap; small against 1.
+
+    Returns:
+        State (*batch, particle).
+    """
+    site = checks.integer("site", site, 1, chain.n_particles)
+    velocity = checks.number("velocity", velocity)
+    start = torch.zeros_like(chain.masses)
+    start[..., site - 1] = velocity
+    return State(torch.zeros_like(start), start)
+
+
+def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float = 0.01, phase: str = "sin") -> State:
+    """A sinusoidal displacement of wavenumber k = 2 pi tone / N at rest (Section 2.6).
+
+    Args:
+        chain: masses (*batch, particle); N particles.
+        tone: 1 to N/2, or a sequence of them.
+        amplitude: in initial overlaps; small against 1.
+        phase: "sin" or "cos". The sine of tone N/2 vanishes at every particle and is an error.
+
+    Returns:
+        State (*batch, particle), or (*batch, tone, particle) for a sequence.
+    """
+    n = chain.n_particles
+    tones = [tone] if isinstance(tone, int) else list(tone)
+    if not tones:
+        raise checks.fail("tone", "hold at least one tone", "none")
+    amplitude = checks.number("amplitude", amplitude)
+    check_tones("tone", tones, n, checks.choice("phase", phase, PHASES))
+    # The phase of particle p is (tone p mod N) / N turns: exact integers, whatever the tone.
+    particle = torch.arange(1, n + 1)
+    turns = torch.stack([(int(m) * particle) % n for m in tones]).to(torch.float64) / n
+    wave = amplitude * (torch.sin if phase == "sin" else torch.cos)(2 * math.pi * turns)
+    if isinstance(tone, int):
+        wave = wave[0]
+    wave = wave.to(chain.masses).expand(*chain.batch_shape, *wave.shape).clone()
+    return State(wave, torch.zeros_like(wave))
+
+
+def check_tones(field: str, tones: Sequence[int], n_particles: int, phase: str) -> None:
+    """An error for a tone outside 1..N/2, and for the sine tone N/2, which is zero everywhere."""
+    for tone in tones:
+        checks.integer(field, tone, 1, n_particles // 2)
+        if phase == "sin" and 2 * tone == n_particles:
+            raise checks.fail(
+                field,
+                f"be less than n_particles/2 = {n_particles // 2} for phase 'sin', which vanishes there (use 'cos')",
+                tone,
+            )
+
+
+@dataclass(frozen=True)
+class Impulse:
+    """What a scene says of an impulse; see :func:`impulse`."""
+
+    site: int = 1
+    velocity: float = 0.01
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "site", checks.integer("excitation.site", self.site, 1))
+        object.__setattr__(self, "velocity", checks.number("excitation.velocity", self.velocity))
+        if self.velocity == 0:
+            raise checks.fail("excitation.velocity", "not be zero", self.velocity)
+
+    def check(self, n_particles: int) -> None:
+        checks.integer("excitation.site", self.site, 1, n_particles)
+
+    def state(self, chain: Chain) -> State:
+        return impulse(chain, self.site, self.velocity)
+
+
+@dataclass(frozen=True)
+class StandingWave:
+    """What a scene says of standing waves; see :func:`standing_wave`. Each tone is a wave of its own.
+
+    ``tones=None`` is the center tone of every band, (s - 1/2) N / (2 B) rounded up: 2, 6, ..., 126 for N = 256, B = 32.
+    """
+
+    tones: tuple[int, ...] | None = None
+    amplitude: float = 0.01
+    phase: str = "sin"
+
+    def __post_init__(self) -> None:
+        if self.tones is not None:
+            tones = (self.tones,) if isinstance(self.tones, int) else self.tones
+            if isinstance(tones, str) or not isinstance(tones, Sequence) or not tones:
+                raise checks.FieldTypeError(
+                    f"excitation.tones must be a list of integers, got {checks.shown(self.tones)}"
+                )
+            tones = tuple(checks.integer("excitation.tones", tone, 1) for tone in tones)
+            if len(set(tones)) < len(tones):
+                raise checks.fail("excitation.tones", "be different", tones)
+            object.__setattr__(self, "tones", tones)
+        object.__setattr__(self, "amplitude", checks.number("excitation.amplitude", self.amplitude))
+        if self.amplitude == 0:
+            raise checks.fail("excitation.amplitude", "not be zero", self.amplitude)
+        checks.choice("excitation.phase", self.phase, PHASES)
+
+    def check(self, n_particles: int) -> None:
+        check_tones("excitation.tones", self.tones or (), n_particles, self.phase)
+
+    def state(self, chain: Chain) -> State:
+        assert self.tones is not None, "a scene resolves its tones first"
+        return standing_wave(chain, self.tones, self.amplitude, self.phase)
+
+
+def center_tones(n_particles: int, n_bands: int) -> tuple[int, ...]:
+    """The center tone of every band, (s - 1/2) N / (2 B) rounded up to an integer."""
+    width = n_particles // (2 * n_bands)
+    return tuple(math.ceil((2 * band - 1) * width / 2) for band in range(1, n_bands + 1))

@@ -1,0 +1,91 @@
+"""Normal modes of linear chains by batched eigen-decomposition (Eqs. 16-18)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import Chain
+
+
+class DecompositionError(RuntimeError):
+    """An eigen-solver returned modes that are not the chain's."""
+
+
+@dataclass(frozen=True, eq=False)
+class NormalModes:
+    """Frequencies (*batch, mode), ascending, and shapes (*batch, particle, mode) with shapes^T M shapes = 1 (Eq. 17)."""
+
+    frequencies: Tensor
+    shapes: Tensor
+
+
+def normal_modes(chain: Chain) -> NormalModes:
+    """Normal modes of the linear (or linearized) chain, checked for residual and orthogonality.
+
+    Solves the symmetric problem for M^(-1/2) K M^(-1/2). Each frequency is then taken anew from its mode's own
+    elongations, w^2 = sum over contacts of kappa e^2, which is accurate relative to w itself where the solver's
+    w^2 is accurate only relative to the largest. A periodic chain's zero mode is set exactly: w = 0, uniform.
+
+    Args:
+        chain: linear contacts, or Hertz contacts taken at the initial overlap.
+
+    Returns:
+        NormalModes, dtype and device of the masses.
+
+    Raises:
+        FieldError: if the chain is damped (its modes are not normal).
+        DecompositionError: naming the first realization whose modes fail the check.
+    """
+    if chain.is_damped:
+        raise checks.fail(
+            "damping",
+            "be zero for normal modes (use evolve's method 'damped')",
+            f"up to {chain.damping.max().item():g}",
+        )
+    weight = chain.masses.rsqrt()
+    symmetric = -chain.stiffness_matrix() * weight[..., :, None] * weight[..., None, :]
+    _, vectors = torch.linalg.eigh(symmetric)
+    return checked_modes(chain, vectors)
+
+
+def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
+    """NormalModes from orthonormal eigenvectors of M^(-1/2) K M^(-1/2), ascending, after checking them."""
+    weight = chain.masses.rsqrt()
+    stiffness = chain.stiffness.expand(*chain.batch_shape, chain.n_contacts)
+    shapes = vectors * weight[..., :, None]
+    if chain.boundary == "periodic":
+        uniform = chain.masses.sum(-1, keepdim=True).rsqrt()[..., None].expand_as(shapes[..., :1])
+        shapes = torch.cat([uniform, shapes[..., 1:]], dim=-1)
+        elongation = shapes - shapes.roll(1, -2)
+    else:
+        elongation = torch.nn.functional.pad(shapes, (0, 0, 1, 1)).diff(dim=-2)
+    tension = stiffness[..., None] * elongation
+    squared = (tension * elongation).sum(-2)
+    force = tension.roll(-1, -2) - tension if chain.boundary == "periodic" else tension.diff(dim=-2)
+    residual = (
+        (force * weight[..., :, None] + squared[..., None, :] * shapes / weight[..., :, None])
+        .detach()
+        .abs()
+        .amax((-2, -1))
+    )
+    normalized = shapes / weight[..., :, None]
+    gram = (normalized.mT @ normalized).detach()
+    gram.diagonal(dim1=-2, dim2=-1).sub_(1)
+    orthogonality = gram.abs().amax((-2, -1))
+    limit = 40 * torch.finfo(shapes.dtype).eps * chain.n_particles**0.5
+    bad = ~((residual <= limit * squared.detach().amax(-1)) & (orthogonality <= limit))
+    if bool(bad.any()):
+        where = tuple(int(i) for i in bad.nonzero()[0])
+        raise DecompositionError(
+            f"modes must satisfy the eigenvalue equation and orthogonality to {limit:.1e}, got residual "
+            f"{residual[where].item():.1e} and orthogonality defect {orthogonality[where].item():.1e}"
+            + checks.position(where)
+        )
+    frequencies = squared.sqrt()
+    if chain.boundary == "periodic":
+        frequencies = torch.cat([torch.zeros_like(frequencies[..., :1]), frequencies[..., 1:]], dim=-1)
+    return NormalModes(frequencies, shapes)
