@@ -77,21 +77,30 @@ class Chain:
         return self.n_particles + (self.boundary == "fixed")
 
     @property
+    def contact_stiffness(self) -> Tensor:
+        """The stiffness of every contact, (*batch, contact)."""
+        return torch.as_tensor(self.stiffness).expand(*self.batch_shape, self.n_contacts)
+
+    @property
+    def contact_damping(self) -> Tensor:
+        """The damping of every contact, (*batch, contact)."""
+        return torch.as_tensor(self.damping).expand(*self.batch_shape, self.n_contacts)
+
+    @property
     def batch_shape(self) -> torch.Size:
         return self.masses.shape[:-1]
 
     @property
     def is_damped(self) -> bool:
-        return bool((self.damping > 0).any())
+        return bool((torch.as_tensor(self.damping) > 0).any())
 
     @property
     def is_uniform_ring(self) -> bool:
         """Periodic, with equal linear contacts: the stiffness is diagonal in wavenumber space."""
-        return (
-            self.boundary == "periodic"
-            and self.contact == "linear"
-            and bool((self.stiffness == self.stiffness.flatten()[0]).all())
-        )
+        if self.boundary != "periodic" or self.contact != "linear":
+            return False
+        stiffness = torch.as_tensor(self.stiffness)
+        return bool((stiffness == stiffness.flatten()[0]).all())
 
     def align(self, values: Tensor, field: Tensor) -> Tensor:
         """``values`` (*batch, x) shaped to multiply a ``field`` (*batch, *any, x) of states of these chains."""
@@ -120,7 +129,7 @@ class Chain:
 
     def tension(self, elongation: Tensor) -> Tensor:
         """Pull of every contact relative to the precompressed state, (*batch, *any, contact)."""
-        stiffness = self.align(self.stiffness, elongation)
+        stiffness = self.align(self.contact_stiffness, elongation)
         if self.contact == "linear":
             return stiffness * elongation
         # (2/3) (1 - (1 - e)^(3/2)) without cancellation: with s = sqrt(1 - e) and q = 1 - s, 1 - s^3 = q (3 - 3 q + q^2).
@@ -134,12 +143,12 @@ class Chain:
     def damping_force(self, velocity: Tensor) -> Tensor:
         """Damping force -D v on every particle (Eq. 14), (*batch, *any, particle)."""
         rate = self.elongation(velocity)
-        return self.net(self.align(self.damping, rate) * rate)
+        return self.net(self.align(self.contact_damping, rate) * rate)
 
     def contact_energy(self, displacement: Tensor) -> Tensor:
         """Potential energy of every contact relative to the precompressed state, (*batch, *any, contact), never negative."""
         elongation = self.elongation(displacement)
-        stiffness = self.align(self.stiffness, elongation)
+        stiffness = self.align(self.contact_stiffness, elongation)
         if self.contact == "linear":
             return stiffness * elongation.square() / 2
         # (2/3) [e - (2/5) (1 - (1 - e)^(5/2))] as a polynomial in q; an open contact adds (2/3) per unit length.
@@ -154,7 +163,7 @@ class Chain:
     def stiffness_matrix(self) -> Tensor:
         """K of Eq. 13, symmetric and negative semidefinite, (*batch, particle, particle)."""
         n = self.n_particles
-        stiffness = self.stiffness.expand(*self.batch_shape, self.n_contacts)
+        stiffness = self.contact_stiffness
         left = stiffness if self.boundary == "periodic" else stiffness[..., :-1]
         right = stiffness.roll(-1, -1) if self.boundary == "periodic" else stiffness[..., 1:]
         matrix = torch.diag_embed(-(left + right))
@@ -174,7 +183,7 @@ class Chain:
         over the particles bounds it from above for any positive x (Collatz and Wielandt). Some power steps make x
         a good one; the bound holds after any number of them. Two ulps cover the rounding.
         """
-        stiffness = self.stiffness.expand(*self.batch_shape, self.n_contacts)
+        stiffness = self.contact_stiffness
         x = torch.ones_like(self.masses)
         ratio = x
         for _ in range(sweeps + 1):

@@ -33,8 +33,7 @@ def fail(field: str, rule: str, value: Any) -> FieldError:
 def integer(field: str, value: Any, minimum: int | None = None, maximum: int | None = None) -> int:
     """The value as an int within [minimum, maximum]; a bool or a fraction is an error."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-        if not (isinstance(value, float) and value.is_integer()):
-            raise FieldTypeError(f"{field} must be an integer, got {shown(value)}")
+        raise FieldTypeError(f"{field} must be an integer, got {shown(value)}")
     value = int(value)
     if minimum is not None and value < minimum:
         raise fail(field, f"be at least {minimum}", value)

@@ -44,7 +44,7 @@ def normal_modes(chain: Chain) -> NormalModes:
         raise checks.fail(
             "damping",
             "be zero for normal modes (use evolve's method 'damped')",
-            f"up to {chain.damping.max().item():g}",
+            f"up to {chain.contact_damping.max().item():g}",
         )
     weight = chain.masses.rsqrt()
     symmetric = -chain.stiffness_matrix() * weight[..., :, None] * weight[..., None, :]
@@ -55,7 +55,7 @@ def normal_modes(chain: Chain) -> NormalModes:
 def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
     """NormalModes from orthonormal eigenvectors of M^(-1/2) K M^(-1/2), ascending, after checking them."""
     weight = chain.masses.rsqrt()
-    stiffness = chain.stiffness.expand(*chain.batch_shape, chain.n_contacts)
+    stiffness = chain.contact_stiffness
     shapes = vectors * weight[..., :, None]
     if chain.boundary == "periodic":
         uniform = chain.masses.sum(-1, keepdim=True).rsqrt()[..., None].expand_as(shapes[..., :1])

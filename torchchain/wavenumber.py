@@ -50,7 +50,7 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
         moving = _product(_transform(masses * velocity), _transform(velocity))
         if chain.is_uniform_ring:
             k = 2 * math.pi / n * torch.arange(n // 2 + 1, dtype=velocity.dtype, device=velocity.device)
-            strain = chain.stiffness[..., :1].reshape(-1)[0] * 4 * torch.sin(k / 2).square()
+            strain = chain.contact_stiffness.flatten()[0] * 4 * torch.sin(k / 2).square()
             wave = _transform(displacement)
             bound = strain * _product(wave, wave)
         else:
@@ -59,7 +59,7 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
     else:
         elongation = chain.elongation(displacement)
         moved = _transform(masses.sqrt() * velocity)
-        stretched = _transform(chain.align(chain.stiffness, elongation).sqrt() * elongation)
+        stretched = _transform(chain.align(chain.contact_stiffness, elongation).sqrt() * elongation)
         if chain.boundary == "fixed":  # N + 1 contacts on N wavenumbers: a transform of their own length would not fit
             raise checks.fail(
                 "boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from torch import Tensor
-
 from torchchain import checks
 from torchchain.chain import Chain
 from torchchain.evolvers import modes
@@ -52,6 +50,6 @@ def start(chain: Chain, state: State, method: str, **options: Any) -> Advance:
         raise checks.fail(
             "damping",
             f"be zero for method '{method}' (methods with damping: {', '.join(name for name, m in METHODS.items() if m.damped)})",
-            f"up to {chain.damping.max().item():g}",
+            f"up to {chain.contact_damping.max().item():g}",
         )
     return entry.start(chain, state, **options)

@@ -30,6 +30,7 @@ def align_modes(chain: Chain, shapes: Tensor, field: Tensor) -> Tensor:
 
 
 def start(chain: Chain, state: State, modes: NormalModes | None = None) -> Advance:
+    """See the registry entry below."""
     modes = normal_modes(chain) if modes is None else modes
     displacement, velocity = (z[..., None, :] for z in modal_amplitudes(chain, state, modes))
     shapes = align_modes(chain, modes.shapes, state.displacement).mT
