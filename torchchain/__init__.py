@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any
 
 _HOME = {
+    "BandTransfer": "ensemble",
     "Chain": "chain",
     "Disorder": "disorder",
     "Impulse": "excitation",
@@ -18,9 +19,10 @@ _HOME = {
     "State": "excitation",
     "Trajectory": "evolvers",
     "METHODS": "evolvers",
+    "band_transfer": "ensemble",
     "band_energy": "wavenumber",
     "basis_fraction": "wavenumber",
-    "bin_energy": "wavenumber",
+    "bin_energy": "bands",
     "energy_center": "energy",
     "energy_matrices": "energy",
     "energy_width": "energy",
@@ -31,6 +33,7 @@ _HOME = {
     "normal_modes": "spectrum",
     "particle_energy": "energy",
     "potential_energy": "energy",
+    "simulate": "ensemble",
     "standing_wave": "excitation",
     "total_energy": "energy",
     "wavenumber_energy": "wavenumber",

@@ -148,9 +148,3 @@ class StandingWave:
     def state(self, chain: Chain) -> State:
         assert self.tones is not None, "a scene resolves its tones first"
         return standing_wave(chain, self.tones, self.amplitude, self.phase)
-
-
-def center_tones(n_particles: int, n_bands: int) -> tuple[int, ...]:
-    """The center tone of every band, (s - 1/2) N / (2 B) rounded up to an integer."""
-    width = n_particles // (2 * n_bands)
-    return tuple(math.ceil((2 * band - 1) * width / 2) for band in range(1, n_bands + 1))

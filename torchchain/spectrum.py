@@ -56,12 +56,16 @@ def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
     """NormalModes from orthonormal eigenvectors of M^(-1/2) K M^(-1/2), ascending, after checking them."""
     weight = chain.masses.rsqrt()
     stiffness = chain.contact_stiffness
-    shapes = vectors * weight[..., :, None]
     if chain.boundary == "periodic":
-        uniform = chain.masses.sum(-1, keepdim=True).rsqrt()[..., None].expand_as(shapes[..., :1])
-        shapes = torch.cat([uniform, shapes[..., 1:]], dim=-1)
+        # The zero mode is uniform; the others are made orthogonal to it, which the solver's error next to it is not.
+        uniform = (chain.masses / chain.masses.sum(-1, keepdim=True)).sqrt()[..., None]
+        others = vectors[..., 1:]
+        others = others - uniform * (uniform.mT @ others)
+        vectors = torch.cat([uniform, others], dim=-1)
+        shapes = vectors * weight[..., :, None]
         elongation = shapes - shapes.roll(1, -2)
     else:
+        shapes = vectors * weight[..., :, None]
         elongation = torch.nn.functional.pad(shapes, (0, 0, 1, 1)).diff(dim=-2)
     tension = stiffness[..., None] * elongation
     squared = (tension * elongation).sum(-2)
@@ -72,8 +76,7 @@ def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
         .abs()
         .amax((-2, -1))
     )
-    normalized = shapes / weight[..., :, None]
-    gram = (normalized.mT @ normalized).detach()
+    gram = (vectors.mT @ vectors).detach()
     gram.diagonal(dim1=-2, dim2=-1).sub_(1)
     orthogonality = gram.abs().amax((-2, -1))
     limit = 40 * torch.finfo(shapes.dtype).eps * chain.n_particles**0.5

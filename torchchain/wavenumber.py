@@ -8,24 +8,13 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.bands import bin_energy, check_bands
 from torchchain.chain import Chain
 from torchchain.energy import DEFINITIONS, EnergyMatrices, require_linear
 from torchchain.evolvers.method import Trajectory
 from torchchain.evolvers.modes import align_modes, modal_amplitudes
 from torchchain.excitation import State
 from torchchain.spectrum import NormalModes, normal_modes
-
-
-def check_bands(n_particles: int, n_bands: int) -> int:
-    """The number of tones per band; an error unless the N/2 tones divide evenly into the bands."""
-    n_bands = checks.integer("n_bands", n_bands, 1)
-    if n_particles % 2:
-        raise checks.fail("n_particles", "be even for wavenumber bands", n_particles)
-    if n_bands > n_particles // 2:
-        raise checks.fail("n_bands", f"be at most the number of tones n_particles/2 = {n_particles // 2}", n_bands)
-    if (n_particles // 2) % n_bands:
-        raise checks.fail("n_bands", f"divide the number of tones n_particles/2 = {n_particles // 2}", n_bands)
-    return n_particles // 2 // n_bands
 
 
 def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "site") -> Tensor:
@@ -88,21 +77,6 @@ def wavenumber_energy_matrix(matrices: EnergyMatrices) -> Tensor:
     angle = (-2 * math.pi / n) * ((index[:, None] * index) % n).to(total.dtype)
     dft = torch.polar(torch.full_like(angle, n**-0.5), angle)
     return torch.einsum("kp,...pq,mq->...km", dft, total.to(dft.dtype), dft.conj())
-
-
-def bin_energy(energy: Tensor, n_bands: int) -> Tensor:
-    """Energies of N//2 + 1 wavenumbers summed into bands (Eq. 44): tone n lies in band ceil(n B / (N/2)), k = 0 in none.
-
-    Args:
-        energy: (*batch, wavenumber), the first wavenumber being k = 0.
-        n_bands: B, a divisor of N/2.
-
-    Returns:
-        (*batch, band).
-    """
-    tones = energy.shape[-1] - 1
-    width = check_bands(2 * tones, n_bands)
-    return energy[..., 1:].reshape(*energy.shape[:-1], n_bands, width).sum(-1)
 
 
 def band_energy(

@@ -1,0 +1,456 @@
+"""Stream the realizations of a scene through evolution and observables into means, error bars and long-time averages."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+import xarray
+from torch import Tensor
+from tqdm import tqdm
+
+from torchchain import checks, planning
+from torchchain.bands import band_of
+from torchchain.chain import Chain
+from torchchain.energy import energy_center, energy_width, particle_energy, total_energy
+from torchchain.evolvers import Trajectory, start
+from torchchain.excitation import Impulse, StandingWave, State
+from torchchain.scene import Scene
+from torchchain.spectrum import NormalModes, normal_modes
+from torchchain.statistics import Moments, MomentTree
+from torchchain.wavenumber import band_energy, long_time_band_energy, wavenumber_energy
+
+MEMORY_BUDGET = 2**30
+BLOCKS = 20
+
+
+@dataclass(frozen=True)
+class Observable:
+    """A quantity of a trajectory: the axes after realization and tone, its unit and how it is computed."""
+
+    axes: tuple[str, ...]
+    unit: str
+    long_name: str
+    of: Callable[[Scene, Chain, Trajectory], Tensor]
+
+
+def _energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+    return particle_energy(chain, trajectory, scene.energy_definition)
+
+
+def _source_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+    site = scene.excitation.site if isinstance(scene.excitation, Impulse) else 1
+    return _energy(scene, chain, trajectory)[..., site - 1]
+
+
+ENERGY_UNIT = "contact stiffness * initial overlap^2"
+IN_TIME: dict[str, Observable] = {
+    "displacement": Observable(("time", "particle"), "initial overlap", "displacement", lambda s, c, t: t.displacement),
+    "energy": Observable(("time", "particle"), ENERGY_UNIT, "energy per particle", _energy),
+    "source_energy": Observable(("time",), ENERGY_UNIT, "energy of the source particle", _source_energy),
+    "total_energy": Observable(("time",), ENERGY_UNIT, "total energy", lambda s, c, t: total_energy(c, t)),
+    "center": Observable(("time",), "particle", "center of energy R", lambda s, c, t: energy_center(_energy(s, c, t))),
+    "width": Observable(
+        ("time",), "particle^2", "mean squared width r^2", lambda s, c, t: energy_width(_energy(s, c, t))
+    ),
+    "wavenumber_energy": Observable(
+        ("time", "wavenumber"),
+        ENERGY_UNIT,
+        "energy at |k|",
+        lambda s, c, t: wavenumber_energy(c, t, s.energy_definition),
+    ),
+    "band_energy": Observable(
+        ("time", "band"),
+        "1",
+        "share of the energy in a band",
+        lambda s, c, t: band_energy(c, t, s.n_bands, True, s.energy_definition),
+    ),
+}
+
+
+class Stages:
+    """Seconds spent in each named stage of a run."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Realizations first, first + 1, ... of a scene, evolved together."""
+
+    scene: Scene
+    first: int
+    chain: Chain
+    state: State
+    method: str
+    options: dict[str, Any]
+    times: Tensor
+    window: int
+    stages: Stages
+
+    @cached_property
+    def modes(self) -> NormalModes:
+        """The normal modes, computed once if anything asks for them."""
+        with self.stages("eigen-decomposition"):
+            return normal_modes(self.chain)
+
+    def trajectories(self) -> Iterator[Trajectory]:
+        """The states at consecutive windows of the scene's times."""
+        options = {"modes": self.modes, **self.options} if self.method == "modes" else self.options
+        with self.stages("evolution"):
+            advance = start(self.chain, self.state, self.method, **options)
+        for begin in range(0, len(self.times), self.window):
+            with self.stages("evolution"):
+                trajectory = advance(self.times[begin : begin + self.window])
+            yield trajectory
+
+    def long_time(self) -> Tensor:
+        """Infinite-time average of the normalized band energies, (realization, [tone,] band)."""
+        modes = self.modes
+        with self.stages("long-time average"):
+            return long_time_band_energy(self.chain, self.state, self.scene.n_bands, modes=modes)
+
+
+def stream(
+    scene: Scene,
+    method: str = "auto",
+    *,
+    device: str | torch.device = "cpu",
+    memory_budget: int = MEMORY_BUDGET,
+    progress: bool = False,
+    stages: Stages | None = None,
+    options: dict[str, Any] | None = None,
+) -> Iterator[Chunk]:
+    """The realizations of a scene in chunks that keep to a memory budget.
+
+    An ordered scene is one chain however many realizations it asks for, and yields that one alone.
+
+    Args:
+        scene: what is wanted.
+        method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
+        device: where the chains are computed.
+        memory_budget: bytes for a chunk's states and modes; times are cut into windows where one chain exceeds it.
+        progress: show a bar if the output is a terminal.
+        stages: collects seconds per stage.
+        options: the method's own.
+    """
+    options = dict(options or {})
+    if method == "auto":
+        plan = planning.plan(scene)
+        method, options = plan.method, {**plan.options, **options}
+    stages = stages or Stages()
+    budget = checks.integer("memory_budget", memory_budget, 1)
+    state_bytes = 8 * max(1, len(scene.tones)) * scene.n_particles * 10  # states, phases, transforms, products
+    mode_bytes = 8 * scene.n_particles**2 * 8 if method == "modes" else 0
+    realizations = 1 if scene.is_ordered else scene.realizations
+    window = max(1, min(len(scene.times), (budget - mode_bytes) // state_bytes))
+    size = max(1, min(realizations, budget // (mode_bytes + state_bytes * window)))
+    times = scene.times.to(device)
+    with tqdm(total=realizations, unit="chain", disable=None if progress else True, leave=False) as bar:
+        for first in range(0, realizations, size):
+            numbers = range(first, min(first + size, realizations))
+            with stages("masses"):
+                chain = scene.chain(numbers, device)
+                state = scene.state(chain)
+            yield Chunk(scene, first, chain, state, method, options, times, window, stages)
+            bar.update(len(numbers))
+
+
+class MassStatistics:
+    """Realized mean and standard deviation of the masses of an ensemble."""
+
+    def __init__(self) -> None:
+        self.tree = MomentTree()
+
+    def add(self, chunk: Chunk) -> None:
+        """Take in a chunk's masses."""
+        masses = chunk.chain.masses
+        self.tree.add(chunk.first, torch.stack([masses.mean(-1), masses.square().mean(-1)], dim=-1).cpu())
+
+    @property
+    def realized(self) -> dict[str, float]:
+        """``mass_mean`` and ``mass_sd`` over all particles of all realizations."""
+        mean, square = self.tree.result().mean.tolist()
+        return {"mass_mean": mean, "mass_sd": max(0.0, square - mean**2) ** 0.5}
+
+
+def simulate(
+    scene: Scene,
+    method: str = "auto",
+    *,
+    device: str | torch.device = "cpu",
+    memory_budget: int = MEMORY_BUDGET,
+    progress: bool = False,
+    stages: Stages | None = None,
+    options: dict[str, Any] | None = None,
+) -> xarray.Dataset:
+    """Ensemble means of the scene's observables and their standard errors.
+
+    Args:
+        scene: what is wanted; its ``observables`` name the variables.
+        method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
+        device, memory_budget, progress, stages, options: see :func:`stream`.
+
+    Returns:
+        Dataset with a variable and its ``_stderr`` for every observable, axes ([tone,] time, particle | wavenumber |
+        band), coordinates counted from 1, units in the attributes; realized mass moments in the attributes.
+        A single realization of a disordered chain has the standard error infinity.
+    """
+    stages = stages or Stages()
+    trees = {name: MomentTree() for name in scene.observables}
+    masses = MassStatistics()
+    in_time = [name for name in scene.observables if name in IN_TIME]
+    for chunk in stream(
+        scene, method, device=device, memory_budget=memory_budget, progress=progress, stages=stages, options=options
+    ):
+        parts: dict[str, list[Tensor]] = {name: [] for name in in_time}
+        for trajectory in chunk.trajectories() if in_time else ():
+            with stages("observables"):
+                for name in in_time:
+                    parts[name].append(IN_TIME[name].of(scene, chunk.chain, trajectory))
+        with stages("statistics"):
+            masses.add(chunk)
+            for name in in_time:
+                time_axis = -len(IN_TIME[name].axes)
+                trees[name].add(chunk.first, torch.cat(parts[name], dim=time_axis).cpu())
+        if "long_time_band_energy" in trees:
+            trees["long_time_band_energy"].add(chunk.first, chunk.long_time().cpu())
+    return _dataset(scene, {name: tree.result() for name, tree in trees.items()}, masses.realized)
+
+
+def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, Any]) -> xarray.Dataset:
+    leading = ("tone",) if scene.tones else ()
+    variables: dict[str, Any] = {}
+    used: set[str] = set()
+    for name, moment in moments.items():
+        entry = IN_TIME.get(name)
+        axes = leading + (entry.axes if entry else ("band",))
+        used.update(axes)
+        notes = {
+            "units": entry.unit if entry else "1",
+            "long_name": entry.long_name if entry else "infinite-time average of the share of the energy in a band",
+        }
+        variables[name] = (axes, moment.mean.numpy(), notes)
+        error = ordered_error(scene, moment)
+        variables[f"{name}_stderr"] = (
+            axes, error.numpy(), {**notes, "long_name": f"standard error of {notes['long_name']}"},
+        )  # fmt: skip
+    return xarray.Dataset(variables, coords=coordinates(scene, used), attrs=scene_attributes(scene) | attributes)
+
+
+def ordered_error(scene: Scene, moment: Moments) -> Tensor:
+    """Standard error of an ensemble: zero where every realization is the same chain."""
+    return torch.zeros_like(moment.mean) if scene.is_ordered else moment.stderr
+
+
+def coordinates(scene: Scene, axes: set[str]) -> dict[str, Any]:
+    """Coordinates of the given axes, counted from 1, with units."""
+    n = scene.n_particles
+    k = {"units": "rad / particle distance", "long_name": "wavenumber |k|"}
+    every = {
+        "time": (
+            "time",
+            scene.times.numpy(),
+            {"units": "travel time of sound over one particle", "long_name": "time t"},
+        ),
+        "particle": ("particle", np.arange(1, n + 1), {"long_name": "particle number p"}),
+        "tone": ("tone", np.array(scene.tones, dtype=np.int64), {"long_name": "tone of the standing wave"}),
+        "band": ("band", np.arange(1, scene.n_bands + 1), {"long_name": "wavenumber band r"}),
+        "wavenumber": ("wavenumber", 2 * np.pi / n * np.arange(n // 2 + 1), k),
+    }
+    return {name: every[name] for name in every if name in axes}
+
+
+def scene_attributes(scene: Scene) -> dict[str, Any]:
+    """What every result says of its scene."""
+    from torchchain import __version__
+
+    return {
+        "scene": scene.to_toml(),
+        "seed": str(scene.seed),
+        "realizations": scene.realizations,
+        "redrawn_fraction": scene.disorder.redrawn_fraction,
+        "torchchain_version": __version__,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class BandTransfer:
+    """Band energies of an ensemble in which each band in turn is the source of a unit energy.
+
+    Attributes:
+        scene: the ensemble; its tones hold one tone of every band, in order.
+        times: (time,).
+        mean, stderr: share of the energy, [source, time, receiver].
+        long_time, long_time_stderr: infinite-time average, [source, receiver]; None if not asked for.
+        block_mean: means over consecutive blocks of realizations, [block, source, time, receiver].
+        block_long_time: [block, source, receiver], or None.
+        block_counts: realizations in each block.
+        attributes: realized mean and standard deviation of the masses, ``mass_mean`` and ``mass_sd``.
+    """
+
+    scene: Scene
+    times: Tensor
+    mean: Tensor
+    stderr: Tensor
+    long_time: Tensor | None
+    long_time_stderr: Tensor | None
+    block_mean: Tensor
+    block_long_time: Tensor | None
+    block_counts: tuple[int, ...]
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def n_bands(self) -> int:
+        return self.mean.shape[-1]
+
+    def to_dataset(self) -> xarray.Dataset:
+        """Labeled axes and units, for netCDF; :meth:`from_dataset` reads it back."""
+        s, t, r, b = "source", "time", "receiver", "block"
+        share = {"units": "1", "long_name": "share of the energy in the receiving band"}
+        variables: dict[str, Any] = {
+            "band_energy": ((s, t, r), self.mean.numpy(), share),
+            "band_energy_stderr": ((s, t, r), self.stderr.numpy(), {"units": "1", "long_name": "its standard error"}),
+            "block_band_energy": ((b, s, t, r), self.block_mean.numpy(), {"units": "1", "long_name": "block means"}),
+            "block_count": ((b,), np.array(self.block_counts), {"units": "1", "long_name": "realizations in a block"}),
+        }
+        if self.long_time is not None and self.long_time_stderr is not None and self.block_long_time is not None:
+            variables["long_time"] = (
+                (s, r), self.long_time.numpy(), {"units": "1", "long_name": "infinite-time average of the share"},
+            )  # fmt: skip
+            variables["long_time_stderr"] = ((s, r), self.long_time_stderr.numpy(), {"units": "1"})
+            variables["block_long_time"] = ((b, s, r), self.block_long_time.numpy(), {"units": "1"})
+        bands = np.arange(1, self.n_bands + 1)
+        coords = {
+            **coordinates(self.scene, {"time"}),
+            s: (s, bands, {"long_name": "band s of the initial standing wave"}),
+            r: (r, bands, {"long_name": "receiving band r"}),
+        }
+        return xarray.Dataset(variables, coords=coords, attrs=scene_attributes(self.scene) | self.attributes)
+
+    @classmethod
+    def from_dataset(cls, data: xarray.Dataset) -> BandTransfer:
+        """The inverse of :meth:`to_dataset`."""
+        import tomllib
+
+        scene = Scene.from_dict(tomllib.loads(data.attrs["scene"]))
+
+        def tensor(name: str) -> Tensor:
+            return torch.from_numpy(np.array(data[name].values))
+
+        held = "long_time" in data
+        return cls(
+            scene,
+            scene.times,
+            tensor("band_energy"),
+            tensor("band_energy_stderr"),
+            tensor("long_time") if held else None,
+            tensor("long_time_stderr") if held else None,
+            tensor("block_band_energy"),
+            tensor("block_long_time") if held else None,
+            tuple(int(n) for n in data["block_count"].values),
+            {name: float(data.attrs[name]) for name in ("mass_mean", "mass_sd")},
+        )
+
+
+def band_transfer(
+    scene: Scene,
+    method: str = "auto",
+    long_time: bool = True,
+    *,
+    device: str | torch.device = "cpu",
+    memory_budget: int = MEMORY_BUDGET,
+    progress: bool = False,
+    stages: Stages | None = None,
+    options: dict[str, Any] | None = None,
+) -> BandTransfer:
+    """The transfer of energy from every band to every band: one standing wave per band, averaged over the ensemble.
+
+    Args:
+        scene: standing waves with one tone in each of its bands, or none given (the bands' center tones).
+        method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
+        long_time: also take the exact infinite-time average from the modes.
+        device, memory_budget, progress, stages, options: see :func:`stream`.
+
+    Returns:
+        BandTransfer with mean and stderr [source, time, receiver].
+
+    Raises:
+        FieldError: if the excitation is no standing wave, or a band has not exactly one tone.
+    """
+    scene = _transfer_scene(scene)
+    stages = stages or Stages()
+    realizations = 1 if scene.is_ordered else scene.realizations
+    n_blocks = min(BLOCKS, realizations)
+    edges = [realizations * b // n_blocks for b in range(n_blocks + 1)]
+    trees = [(MomentTree(), MomentTree()) for _ in range(n_blocks)]
+    masses = MassStatistics()
+    for chunk in stream(
+        scene, method, device=device, memory_budget=memory_budget, progress=progress, stages=stages, options=options
+    ):
+        parts = []
+        for trajectory in chunk.trajectories():
+            with stages("band energies"):
+                parts.append(IN_TIME["band_energy"].of(scene, chunk.chain, trajectory))
+        average = chunk.long_time().cpu() if long_time else None
+        with stages("statistics"):
+            masses.add(chunk)
+            values = torch.cat(parts, dim=-2).cpu()
+            for block, (in_time, at_end) in enumerate(trees):
+                begin, end = max(edges[block], chunk.first), min(edges[block + 1], chunk.first + len(values))
+                if begin < end:
+                    part = slice(begin - chunk.first, end - chunk.first)
+                    in_time.add(begin - edges[block], values[part])
+                    if average is not None:
+                        at_end.add(begin - edges[block], average[part])
+    blocks = [in_time.result() for in_time, _ in trees]
+    total = _merged(blocks)
+    ends = [at_end.result() for _, at_end in trees] if long_time else []
+    average_at_end = _merged(ends) if ends else None
+    return BandTransfer(
+        scene,
+        scene.times,
+        total.mean,
+        ordered_error(scene, total),
+        average_at_end.mean if average_at_end else None,
+        ordered_error(scene, average_at_end) if average_at_end else None,
+        torch.stack([block.mean for block in blocks]),
+        torch.stack([block.mean for block in ends]) if ends else None,
+        tuple(block.count for block in blocks),
+        dict(masses.realized),
+    )
+
+
+def _merged(parts: list[Moments]) -> Moments:
+    total = parts[0]
+    for part in parts[1:]:
+        total = total.merge(part)
+    return total
+
+
+def _transfer_scene(scene: Scene) -> Scene:
+    """The scene with its tones spelled out, checked for one tone in every band."""
+    if not isinstance(scene.excitation, StandingWave):
+        raise checks.fail("excitation", "be standing waves for a band transfer", type(scene.excitation).__name__)
+    scene = replace(scene, observables=("band_energy",), excitation=replace(scene.excitation, tones=scene.tones))
+    bands = [band_of(tone, scene.n_particles, scene.n_bands) for tone in scene.tones]
+    if bands != list(range(1, scene.n_bands + 1)):
+        raise checks.fail(
+            "excitation.tones", f"lie one in each of the {scene.n_bands} bands, in order", f"bands {bands}"
+        )
+    return scene

@@ -1,0 +1,266 @@
+"""What is wanted: a scene, from Python, a dictionary or a TOML file, checked field by field."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.bands import center_tones, check_bands
+from torchchain.chain import BOUNDARIES, CONTACTS, Chain
+from torchchain.disorder import Disorder
+from torchchain.excitation import Impulse, StandingWave, State
+
+OBSERVABLES = (
+    "band_energy",
+    "center",
+    "displacement",
+    "energy",
+    "long_time_band_energy",
+    "source_energy",
+    "total_energy",
+    "wavenumber_energy",
+    "width",
+)
+BAND_OBSERVABLES = frozenset({"band_energy", "long_time_band_energy"})
+EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse, "standing_wave": StandingWave}
+LARGEST_CHAIN = 10**8
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An ensemble of chains, how they are set in motion, and what is to be measured. The defaults are the paper's.
+
+    Attributes:
+        n_particles: N.
+        boundary: "periodic" or "fixed".
+        disorder: of the masses.
+        excitation: Impulse or StandingWave; every tone of a StandingWave is a run of its own.
+        times: output times (time,), in travel times of sound over one particle.
+        n_bands: B, looked at only where bands are asked for, or tones are left to the bands' centers.
+        realizations: chains in the ensemble.
+        seed: realization i of it is the same chain in every run.
+        tolerance: accuracy wanted for the observables, relative to their scale; None for the ensemble's own error.
+        observables: names from ``OBSERVABLES``.
+        stiffness_disorder: of the contact stiffnesses; None for equal contacts.
+        contact: "linear" or "hertz".
+        damping: contact damping coefficient.
+        energy_definition: "site" (Eqs. 36, 42) or "bond" (Eq. A3).
+
+    Raises:
+        FieldError, FieldTypeError: one line with the field, the rule and the value.
+    """
+
+    n_particles: int = 256
+    boundary: str = "periodic"
+    disorder: Disorder = field(default_factory=Disorder)
+    excitation: Impulse | StandingWave = field(default_factory=StandingWave)
+    times: Any = field(default_factory=lambda: regular_times(0.0, 50.0, 0.25))
+    n_bands: int = 32
+    realizations: int = 100
+    seed: int = 0
+    tolerance: float | None = None
+    observables: tuple[str, ...] = ("band_energy",)
+    stiffness_disorder: Disorder | None = None
+    contact: str = "linear"
+    damping: float = 0.0
+    energy_definition: str = "site"
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        put("n_particles", checks.integer("n_particles", self.n_particles, 2, LARGEST_CHAIN))
+        checks.choice("boundary", self.boundary, BOUNDARIES)
+        put("realizations", checks.integer("realizations", self.realizations, 1, 10**9))
+        put("seed", checks.integer("seed", self.seed, 0, 2**64 - 1))
+        put("n_bands", checks.integer("n_bands", self.n_bands, 1))
+        for name, kinds in (("disorder", Disorder), ("excitation", (Impulse, StandingWave))):
+            if not isinstance(getattr(self, name), kinds):
+                raise checks.FieldTypeError(f"{name} must be a table, got {checks.shown(getattr(self, name))}")
+        if self.stiffness_disorder is not None and not isinstance(self.stiffness_disorder, Disorder):
+            raise checks.FieldTypeError(
+                f"stiffness_disorder must be a table, got {checks.shown(self.stiffness_disorder)}"
+            )
+        put("times", checks.times("times", self.times).to(torch.float64))
+        if self.tolerance is not None:
+            put("tolerance", checks.number("tolerance", self.tolerance, above=0, below=1))
+        checks.choice("contact", self.contact, CONTACTS)
+        put("damping", checks.number("damping", self.damping, at_least=0))
+        checks.choice("energy_definition", self.energy_definition, ("site", "bond"))
+        if isinstance(self.observables, str) or not isinstance(self.observables, Sequence) or not self.observables:
+            raise checks.FieldTypeError(f"observables must be a list of names, got {checks.shown(self.observables)}")
+        put("observables", tuple(checks.choice("observables", name, OBSERVABLES) for name in self.observables))
+        self.excitation.check(self.n_particles)
+        if self.needs_bands:
+            check_bands(self.n_particles, self.n_bands)
+            if isinstance(self.excitation, StandingWave):  # the center tone of the last band can be N/2
+                dataclasses.replace(self.excitation, tones=self.tones).check(self.n_particles)
+        if self.contact == "hertz":
+            for name in {*BAND_OBSERVABLES, "wavenumber_energy"} & set(self.observables):
+                raise checks.fail("contact", f"be 'linear' for the observable {name}", repr(self.contact))
+            if self.energy_definition == "site":
+                put("energy_definition", "bond")  # the only one that a Hertz contact has
+        if self.damping > 0 and "long_time_band_energy" in self.observables:
+            raise checks.fail("damping", "be zero for the observable long_time_band_energy", self.damping)
+
+    @property
+    def needs_bands(self) -> bool:
+        """Whether ``n_bands`` matters: a band observable, or standing waves at the bands' center tones."""
+        centers = isinstance(self.excitation, StandingWave) and self.excitation.tones is None
+        return centers or bool(BAND_OBSERVABLES & set(self.observables))
+
+    @property
+    def is_ordered(self) -> bool:
+        """Whether every realization is the same chain."""
+        return self.disorder.strength == 0 and (
+            self.stiffness_disorder is None or self.stiffness_disorder.strength == 0
+        )
+
+    @property
+    def tones(self) -> tuple[int, ...]:
+        """The tones of the standing waves, counted from 1; empty for an impulse."""
+        if isinstance(self.excitation, Impulse):
+            return ()
+        return self.excitation.tones or center_tones(self.n_particles, self.n_bands)
+
+    def chain(
+        self, realizations: Iterable[int], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
+    ) -> Chain:
+        """The chains of the given realizations (counted from 0), masses (realization, particle)."""
+        numbers = list(realizations)
+        masses = self.disorder.masses(self.n_particles, numbers, self.seed)
+        stiffness: float | Tensor = 1.0
+        if self.stiffness_disorder is not None:
+            n_contacts = self.n_particles + (self.boundary == "fixed")
+            stiffness = self.stiffness_disorder.stiffnesses(n_contacts, numbers, self.seed).to(device, dtype)
+        return Chain(masses.to(device, dtype), self.boundary, stiffness, self.contact, self.damping)
+
+    def state(self, chain: Chain) -> State:
+        """The start of every chain, (realization, particle) or (realization, tone, particle)."""
+        if isinstance(self.excitation, Impulse):
+            return self.excitation.state(chain)
+        return dataclasses.replace(self.excitation, tones=self.tones).state(chain)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as in a scene file; fields that are None are left out."""
+        plain: dict[str, Any] = {}
+        for entry in dataclasses.fields(self):
+            value = getattr(self, entry.name)
+            if entry.name == "times":
+                value = _times_table(value)
+            elif entry.name == "excitation":
+                kind = "impulse" if isinstance(value, Impulse) else "standing_wave"
+                value = {"kind": kind, **_plain(value)}
+            elif isinstance(value, Disorder):
+                value = _plain(value)
+            elif isinstance(value, tuple):
+                value = list(value)
+            if value is not None:
+                plain[entry.name] = value
+        return plain
+
+    def to_toml(self) -> str:
+        """The scene as the text of a scene file."""
+        return tomli_w.dumps(self.to_dict())
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Scene:
+        """A scene from the plain values of a scene file; an unknown key is an error."""
+        checks.known_keys("scene", plain, [entry.name for entry in dataclasses.fields(cls)])
+        fields = dict(plain)
+        for name in ("disorder", "stiffness_disorder"):
+            if name in fields:
+                fields[name] = _from_table(name, fields[name], Disorder)
+        if "excitation" in fields:
+            table = _table("excitation", fields["excitation"])
+            kind = checks.choice("excitation.kind", table.pop("kind", "standing_wave"), EXCITATIONS)
+            fields["excitation"] = _from_table("excitation", table, EXCITATIONS[kind])
+        if isinstance(fields.get("times"), Mapping):
+            table = _table("times", fields["times"])
+            checks.known_keys("times", table, ("start", "stop", "step"))
+            for key in ("stop", "step"):
+                if key not in table:
+                    raise checks.fail("times", f"have {key}", dict(table))
+            fields["times"] = regular_times(table.get("start", 0.0), table["stop"], table["step"])
+        for name in ("observables",):
+            if isinstance(fields.get(name), list):
+                fields[name] = tuple(fields[name])
+        return cls(**fields)
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Scene:
+        """A scene from a TOML file whose keys are the fields."""
+        return cls.from_dict(read_toml(path))
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The tables of a TOML file; every failure is one line that names the file."""
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise checks.fail(f"config {path}", "be a TOML file", f"{error}") from None
+    except OSError as error:
+        raise checks.fail(f"config {path}", "be a readable file", f"{error.strerror or error}") from None
+
+
+def regular_times(start: float, stop: float, step: float) -> Tensor:
+    """start, start + step, ... up to and including stop (within rounding), (time,) float64."""
+    start = checks.number("times.start", start, at_least=0)
+    stop = checks.number("times.stop", stop, at_least=start)
+    step = checks.number("times.step", step, above=0)
+    count = (stop - start) / step * (1 + 1e-12) + 1e-9
+    if count >= 10**8:
+        raise checks.fail("times.step", "give fewer than 100000000 times", step)
+    return start + step * torch.arange(int(count) + 1, dtype=torch.float64)
+
+
+def _times_table(times: Tensor) -> Any:
+    """A regular grid as its table, other times as a list."""
+    if len(times) > 2:
+        start, step = float(times[0]), float(times[1] - times[0])
+        stop = float(times[-1])
+        if stop / step < 10**7 and torch.equal(regular_times(start, stop, step), times):
+            return {"start": start, "stop": stop, "step": step}
+    return times.tolist()
+
+
+def _plain(record: Any) -> dict[str, Any]:
+    values = dataclasses.asdict(record)
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items() if v is not None}
+
+
+def _table(field_name: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise checks.FieldTypeError(f"{field_name} must be a table, got {checks.shown(value)}")
+    return dict(value)
+
+
+def _from_table(field_name: str, value: Any, kind: type) -> Any:
+    table = _table(field_name, value)
+    checks.known_keys(field_name, table, [entry.name for entry in dataclasses.fields(kind)])
+    return kind(**table)
+
+
+def describe(scene: Scene) -> str:
+    """The scene in one line, for titles and logs."""
+    wave = (
+        f"impulse at particle {scene.excitation.site}"
+        if isinstance(scene.excitation, Impulse)
+        else f"{len(scene.tones)} standing waves"
+    )
+    end = np.format_float_positional(float(scene.times[-1]), trim="-")
+    return (
+        f"{scene.realizations} {scene.boundary} chains, N = {scene.n_particles}, xi = {scene.disorder.strength:g}, "
+        f"{wave}, {len(scene.times)} times to {end}"
+    )

@@ -1,0 +1,82 @@
+"""Mean and standard error over realizations, the same to the last bit however the realizations are cut into chunks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Count, mean and sum of squared deviations of realizations; mean and sum have the shape of one of them."""
+
+    count: int
+    mean: Tensor
+    squares: Tensor
+
+    @property
+    def stderr(self) -> Tensor:
+        """Standard error of the mean; infinite for a single realization, whose error nothing tells."""
+        if self.count < 2:
+            return torch.full_like(self.mean, torch.inf)
+        return (self.squares / (self.count - 1) / self.count).sqrt()
+
+    def merge(self, other: Moments) -> Moments:
+        """The moments of both sets (Chan, Golub and LeVeque 1983)."""
+        count = self.count + other.count
+        difference = other.mean - self.mean
+        mean = self.mean + difference * (other.count / count)
+        squares = self.squares + other.squares + difference * difference * (self.count * other.count / count)
+        return Moments(count, mean, squares)
+
+
+class MomentTree:
+    """Running moments of numbered realizations that come in any chunks and any order.
+
+    Node (level, i) holds the moments of realizations i 2^level to (i + 1) 2^level - 1 and is always the merger
+    of its two children. Which numbers meet which is fixed by the realization numbers alone, so that the result is
+    bitwise the same for every chunk size and every division among processes. At most about log2(R) nodes wait.
+    """
+
+    def __init__(self) -> None:
+        self.waiting: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+        self.count = 0
+
+    def add(self, first: int, values: Tensor) -> None:
+        """Take in realizations first, first + 1, ...; values (realization, ...)."""
+        self.count += len(values)
+        level, start, mean, squares = 0, first, values, torch.zeros_like(values)
+        while len(mean):
+            if start % 2:
+                left = self.waiting.pop((level, start - 1), None)
+                if left is None:
+                    self.waiting[level, start] = (mean[0].clone(), squares[0].clone())
+                    mean, squares, start = mean[1:], squares[1:], start + 1
+                else:
+                    mean, squares = torch.cat([left[0][None], mean]), torch.cat([left[1][None], squares])
+                    start -= 1
+            if len(mean) % 2:
+                last = start + len(mean) - 1
+                right = self.waiting.pop((level, last + 1), None)
+                if right is None:
+                    self.waiting[level, last] = (mean[-1].clone(), squares[-1].clone())
+                    mean, squares = mean[:-1], squares[:-1]
+                else:
+                    mean, squares = torch.cat([mean, right[0][None]]), torch.cat([squares, right[1][None]])
+            difference = mean[1::2] - mean[0::2]
+            squares = squares[0::2] + squares[1::2] + difference * difference * (2.0**level / 2)
+            mean = mean[0::2] + difference / 2
+            level, start = level + 1, start // 2
+
+    def result(self) -> Moments:
+        """The moments of all realizations taken in."""
+        nodes = sorted(self.waiting.items(), key=lambda item: item[0][1] << item[0][0])
+        if not nodes:
+            raise ValueError("no realizations were taken in")
+        parts = [Moments(2**level, mean, squares) for (level, _), (mean, squares) in nodes]
+        total = parts[0]
+        for part in parts[1:]:
+            total = total.merge(part)
+        return total
