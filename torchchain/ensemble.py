@@ -26,7 +26,8 @@ from torchchain.spectrum import NormalModes, normal_modes
 from torchchain.statistics import Moments, MomentTree
 from torchchain.wavenumber import band_energy, long_time_band_energy, wavenumber_energy
 
-MEMORY_BUDGET = 2**30
+MEMORY_BUDGET = 2**29
+CACHE_FRIENDLY = 2**26  # states of a chunk beyond this size cost more per byte: page faults
 BLOCKS = 20
 
 
@@ -158,8 +159,8 @@ def stream(
     state_bytes = 8 * max(1, len(scene.tones)) * scene.n_particles * 10  # states, phases, transforms, products
     mode_bytes = 8 * scene.n_particles**2 * 8 if method == "modes" else 0
     realizations = 1 if scene.is_ordered else scene.realizations
-    window = max(1, min(len(scene.times), (budget - mode_bytes) // state_bytes))
-    size = max(1, min(realizations, budget // (mode_bytes + state_bytes * window)))
+    window = max(1, min(len(scene.times), min(budget - mode_bytes, CACHE_FRIENDLY) // state_bytes))
+    size = max(1, min(realizations, min(budget, mode_bytes + CACHE_FRIENDLY) // (mode_bytes + state_bytes * window)))
     times = scene.times.to(device)
     with tqdm(total=realizations, unit="chain", disable=None if progress else True, leave=False) as bar:
         for first in range(0, realizations, size):

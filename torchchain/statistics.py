@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -30,6 +31,19 @@ class Moments:
         mean = self.mean + difference * (other.count / count)
         squares = self.squares + other.squares + difference * difference * (self.count * other.count / count)
         return Moments(count, mean, squares)
+
+
+def total_variation(p: Tensor, q: Tensor) -> Tensor:
+    """Distance of two distributions over bands, sum over bands of |p - q| / 2, (*batch,) from (*batch, band)."""
+    return (p - q).abs().sum(-1) / 2
+
+
+def statistical_distance(stderr: Tensor) -> Tensor:
+    """Expected total variation between two independent ensembles whose means have this standard error, (*batch,).
+
+    The difference of two normal means of standard error s has the mean absolute value 2 s / sqrt(pi).
+    """
+    return stderr.sum(-1) / math.sqrt(math.pi)
 
 
 class MomentTree:

@@ -1,0 +1,49 @@
+"""A guard for methods that step in time: the energy a chain keeps, plus what damping took, must stay what it was."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import Chain
+from torchchain.evolvers.method import Trajectory
+
+
+class EnergyDriftError(RuntimeError):
+    """A time integration whose energy left the allowed range: its step or tolerance is too large."""
+
+
+def total(chain: Chain, displacement: Tensor, velocity: Tensor) -> Tensor:
+    """Energy relative to the precompressed state, (*batch, *any, x) -> (*batch, *any)."""
+    kinetic = chain.align(chain.masses, velocity) * velocity.square()
+    return kinetic.sum(-1) / 2 + chain.contact_energy(displacement).sum(-1)
+
+
+def check(chain: Chain, trajectory: Trajectory, initial: Tensor, allowed: float, remedy: str) -> None:
+    """An error where the energy kept and dissipated differs from the initial one by more than the fraction allowed.
+
+    Args:
+        chain: the chain of the trajectory.
+        trajectory: the states to check.
+        initial: energy at time 0, (*batch, *any).
+        allowed: largest relative deviation; not a number never passes.
+        remedy: what the user can do, for the message.
+
+    Raises:
+        EnergyDriftError: naming the realization and the time.
+    """
+    with torch.no_grad():
+        energy = total(chain, trajectory.displacement, trajectory.velocity)
+        if trajectory.dissipated is not None:
+            energy = energy + trajectory.dissipated
+        drift = (energy - initial[..., None]).abs()
+        bad = ~(drift <= allowed * initial[..., None])
+        if not bool(bad.any()):
+            return
+        where = tuple(int(i) for i in bad.nonzero()[0])
+        raise EnergyDriftError(
+            f"energy must stay within {allowed:.2g} of its initial {initial[where[:-1]].item():.4g}, got "
+            f"{energy[where].item():.4g} at time {trajectory.times[where[-1]].item():g}"
+            f"{checks.position(where[:-1])} ({remedy})"
+        )

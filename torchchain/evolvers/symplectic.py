@@ -1,0 +1,268 @@
+"""Symplectic compositions of drifts and kicks, shared by the methods ``verlet`` and ``symplectic4``.
+
+A drift moves the particles at constant velocity, a kick changes the velocities by the contact forces at rest; each is
+solved exactly, so any sequence of them is symplectic. Two implementations are tested to be equal: plain torch, which
+is differentiable and runs on any device, and a numba loop for CPU tensors that need no gradient.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import Chain
+from torchchain.evolvers import drift
+from torchchain.evolvers.method import Advance, Trajectory
+from torchchain.excitation import State
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Composition:
+    """One step as drifts and kicks, each for a fraction of the step: (drift, kick), (drift, kick), ...
+
+    Attributes:
+        opening, middle, closing: the pairs; the opening's follow the closing's of the step before.
+        limit: largest stable w h, w the highest frequency and h the step.
+        default: w h where no step is given.
+    """
+
+    opening: Pair
+    middle: tuple[Pair, ...]
+    closing: Pair
+    limit: float
+    default: float
+
+
+def highest_frequency(chain: Chain, overlap: Tensor | float = 1.0) -> Tensor:
+    """An upper bound on the frequencies of contacts with at most this overlap (initially 1), (*batch,).
+
+    A Hertz contact is stiffer than at the initial overlap by the square root of its overlap.
+    """
+    with torch.no_grad():
+        squared = chain.squared_frequency_bound()
+        if chain.contact == "hertz":
+            squared = squared * torch.as_tensor(overlap).clamp(min=1).sqrt()
+        return squared.sqrt()
+
+
+def damping_rate(chain: Chain) -> Tensor:
+    """An upper bound on the eigenvalues of M^-1 D, (*batch,)."""
+    with torch.no_grad():
+        damping = chain.contact_damping
+        floor = 1e-12 * damping.amax(-1, keepdim=True)
+        if not bool((floor > 0).all()):
+            floor = floor + torch.finfo(damping.dtype).tiny ** 0.5
+        as_stiffness = torch.maximum(damping, floor)
+        return replace(chain, stiffness=as_stiffness, contact="linear", damping=0.0).squared_frequency_bound()
+
+
+def largest_overlap(chain: Chain, state: State) -> Tensor:
+    """The largest overlap that the state's energy allows any Hertz contact, now and later, (*batch,).
+
+    The energy of a contact compressed by x is at least kappa x^2 / 2, and no contact can hold more than all of it.
+    """
+    with torch.no_grad():
+        energy = drift.total(chain, state.displacement, state.velocity)
+        energy = energy.reshape(*chain.batch_shape, -1).amax(-1)
+        return 1 + (2 * energy / chain.contact_stiffness.amin(-1)).sqrt()
+
+
+def initial_overlap(chain: Chain, state: State) -> Tensor:
+    """The largest overlap of any contact of the state, (*batch,)."""
+    with torch.no_grad():
+        elongation = chain.elongation(state.displacement)
+        return 1 - elongation.reshape(*chain.batch_shape, -1).amin(-1)
+
+
+def checked_step(chain: Chain, state: State, composition: Composition, method: str, step: float | None) -> float:
+    """The step, if it is stable, or the default step, which is stable for any motion the energy allows.
+
+    Raises:
+        FieldError: for a step at or beyond the stability limit of the chain (at the start's overlaps for Hertz contacts).
+    """
+    damping = damping_rate(chain) if chain.is_damped else None
+    if step is None:
+        default = composition.default / highest_frequency(chain, largest_overlap(chain, state))
+        return (default if damping is None else torch.minimum(default, 0.5 / damping)).amin().item()
+    step = checks.number("step", step, above=0)
+    limits = [("w_max", composition.limit, highest_frequency(chain, initial_overlap(chain, state)))]
+    if damping is not None:
+        limits.append(("the largest eigenvalue of M^-1 D, which is", 2.0, damping))
+    for name, bound, rate in limits:
+        largest = rate.amax()
+        if not step * largest.item() < bound:
+            where = tuple(int(i) for i in (rate == largest).nonzero()[0])
+            raise checks.fail(
+                "step",
+                f"be less than {bound / largest.item():.6g}, the stability limit {bound:.6g} / w of method "
+                f"'{method}' with w = {name} {largest.item():.6g}{checks.position(where)}".replace("w = w_max", "w_max ="),
+                step,
+            )
+    return step
+
+
+def substeps(now: float, times: list[float], step: float) -> list[int]:
+    """How many equal steps of at most ``step`` lead from each time to the next, the first from ``now``."""
+    counts = []
+    for time in times:
+        # A ratio that only rounding puts above an integer does not cost another step.
+        counts.append(math.ceil((time - now) / step * (1 - 1e-9)))
+        now = time
+    return counts
+
+
+def start(chain: Chain, state: State, composition: Composition, method: str, step: float | None) -> Advance:
+    """The evolution by a composition, its step checked."""
+    step = checked_step(chain, state, composition, method, step)
+    advance = march(chain, state, composition, step)
+    if chain.contact == "linear":
+        return advance
+    initial = drift.total(chain, state.displacement, state.velocity).detach()
+    # A stable step lets the energy of a mode swing by (w h)^2 / 4 over 1 minus that in Verlet's case; more is a drift.
+    ratio = step * highest_frequency(chain, initial_overlap(chain, state)).amax().item() / composition.limit
+    allowed = 0.1 + ratio**2 / (1 - ratio**2) if ratio < 1 else 0.1
+
+    def guarded(times: Tensor) -> Trajectory:
+        trajectory = advance(times)
+        drift.check(chain, trajectory, initial, allowed, f"method '{method}' with step {step:.4g}: use a smaller step")
+        return trajectory
+
+    return guarded
+
+
+def march(chain: Chain, state: State, composition: Composition, step: float) -> Advance:
+    """The evolution by a composition with steps of at most ``step``, which nothing here checks for stability."""
+    dtype = torch.promote_types(chain.masses.dtype, state.displacement.dtype)
+    chain = replace(chain, masses=chain.masses.to(dtype))
+    state = State(state.displacement.to(dtype), state.velocity.to(dtype))
+    tensors = (chain.masses, chain.contact_stiffness, chain.contact_damping, state.displacement, state.velocity)
+    gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    compiled = not gradient and chain.masses.device.type == "cpu" and dtype in (torch.float32, torch.float64)
+    return (_rows if compiled else _tensors)(chain, state, composition, step)
+
+
+def _tensors(chain: Chain, state: State, composition: Composition, step: float) -> Advance:
+    """Plain torch: any device, differentiable, new tensors at every step."""
+    hertz, damped = chain.contact == "hertz", chain.is_damped
+    weight = 1 / chain.align(chain.masses, state.displacement)
+    displacement, velocity = state.displacement, state.velocity
+    lost = torch.zeros_like(displacement[..., 0])
+    peak = chain.elongation(displacement.detach())
+    damping = chain.align(chain.contact_damping, peak)
+    now = 0.0
+
+    def apply(pair: Pair, h: float) -> None:
+        nonlocal displacement, velocity, peak
+        if pair[0] != 0:
+            displacement = displacement + pair[0] * h * velocity
+        if pair[1] != 0:
+            elongation = chain.elongation(displacement)
+            if hertz:
+                peak = torch.maximum(peak, elongation.detach())
+            velocity = velocity + pair[1] * h * weight * chain.net(chain.tension(elongation))
+
+    def damp(duration: float) -> None:
+        nonlocal velocity, lost
+        active = damping * ~chain.open_contacts(displacement) if hertz else damping
+        middle = velocity + duration / 2 * weight * chain.net(active * chain.elongation(velocity))
+        pull = duration * chain.net(active * chain.elongation(middle))
+        after = velocity + weight * pull
+        lost = lost - (pull * (velocity + after)).sum(-1) / 2
+        velocity = after
+
+    def advance(times: Tensor) -> Trajectory:
+        nonlocal now, peak
+        targets, outputs = _targets(times, now), []
+        for target, count in zip(targets, substeps(now, targets, step), strict=True):
+            h = (target - now) / max(count, 1)
+            if damped and count:
+                damp(h / 2)
+            for i in range(count):
+                last = i + 1 == count
+                if i == 0 or damped:
+                    apply(composition.opening, h)
+                for pair in composition.middle:
+                    apply(pair, h)
+                (drifted, kicked), (drifts, kicks) = composition.closing, composition.opening
+                # Without damping between them, the end of a step and the start of the next are one drift and one kick.
+                apply((drifted, kicked) if last or damped else (drifted + drifts, kicked + kicks), h)
+                if damped:
+                    damp(h / 2 if last else h)
+            now = target
+            if hertz:
+                peak = torch.maximum(peak, chain.elongation(displacement.detach()))
+            outputs.append((displacement, velocity, lost, (peak >= 1).sum(-1)))
+        series = [torch.stack(part, dim=chain_axis) for part, chain_axis in zip(zip(*outputs), (-2, -2, -1, -1))]
+        return Trajectory(times, series[0], series[1], series[2] if damped else None, series[3] if hertz else None)
+
+    return advance
+
+
+def _rows(chain: Chain, state: State, composition: Composition, step: float) -> Advance:
+    """The compiled loop: float32 or float64 on the CPU, no gradient."""
+    from torchchain.evolvers.symplectic_kernel import advance_rows
+
+    hertz, damped, periodic = chain.contact == "hertz", chain.is_damped, chain.boundary == "periodic"
+    n, lead = chain.n_particles, state.displacement.shape[:-1]
+    with torch.no_grad():
+        dtype = chain.masses.dtype
+        displacement, velocity = (x.reshape(-1, n).clone() for x in (state.displacement, state.velocity))
+        peak = torch.full((len(displacement), n + 1), -math.inf, dtype=dtype)
+        lost = torch.zeros(len(displacement), dtype=dtype)
+        weight = (1 / chain.masses).reshape(-1, n).contiguous()
+        contacts = [chain.contact_stiffness, chain.contact_damping]
+        if periodic:
+            contacts = [torch.cat([values, values[..., :1]], dim=-1) for values in contacts]
+        stiffness, damping = (values.reshape(-1, n + 1).contiguous() for values in contacts)
+        opening, closing = (torch.tensor(pair, dtype=dtype) for pair in (composition.opening, composition.closing))
+        middle = torch.tensor(composition.middle, dtype=dtype).reshape(-1, 2)
+    now = 0.0
+
+    def advance(times: Tensor) -> Trajectory:
+        nonlocal now
+        targets = _targets(times, now)
+        counts = substeps(now, targets, step)
+        spans = [target - before for before, target in zip([now, *targets], targets)]
+        steps = torch.tensor([span / max(count, 1) for span, count in zip(spans, counts)], dtype=dtype)
+        rows, window = len(displacement), len(targets)
+        out = [torch.empty(rows, window, n, dtype=dtype) for _ in range(2)]
+        losses = torch.empty(rows, window, dtype=dtype)
+        openings = torch.zeros(rows, window, dtype=torch.int64)
+        arrays = [
+            tensor.detach().numpy() for tensor in (displacement, velocity, peak, lost, weight, stiffness, damping)
+        ]
+        advance_rows(
+            torch.get_num_threads(),
+            *arrays,
+            periodic,
+            hertz,
+            damped,
+            *(tensor.numpy() for tensor in (opening, middle, closing, torch.tensor(counts), steps, *out)),
+            losses.numpy(),
+            openings.numpy(),
+        )
+        now = targets[-1]
+        series = [part.reshape(*lead, window, n) for part in out]
+        return Trajectory(
+            times,
+            series[0],
+            series[1],
+            losses.reshape(*lead, window) if damped else None,
+            openings.reshape(*lead, window) if hertz else None,
+        )
+
+    return advance
+
+
+def _targets(times: Tensor, now: float) -> list[float]:
+    """The times as numbers; a window that starts before the last one ended is an error."""
+    targets: list[float] = times.tolist()
+    if targets[0] < now:
+        raise checks.fail("times", f"continue from {now:g}, the end of the last window", targets[0])
+    return targets

@@ -1,0 +1,118 @@
+"""Rates from whole trajectories: Adam on Q, with a conservation penalty or exact by construction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchchain import checks
+from torchchain.master.model import exponentials
+
+CONSTRAINTS = ("exact", "penalty")
+
+
+@dataclass(frozen=True)
+class AdamSettings:
+    """How Adam fits the rates.
+
+    Attributes:
+        constraint: "exact": rates between bands are softplus of a parameter and the diagonal is minus the row sum, so
+            that energy is conserved and no rate is negative; "penalty": all of Q is free and leakage costs.
+        penalty: weight of the mean squared row sum of Q (in 1/time^2) in the loss; for "penalty" alone.
+        steps: largest number of steps.
+        learning_rate: of the parameters in units of their typical size.
+        tolerance: stop when the loss falls by less than this fraction in 50 steps.
+    """
+
+    constraint: str = "exact"
+    penalty: float = 10.0
+    steps: int = 600
+    learning_rate: float = 0.03
+    tolerance: float = 1e-4
+
+    def __post_init__(self) -> None:
+        checks.choice("constraint", self.constraint, CONSTRAINTS)
+        checks.number("penalty", self.penalty, at_least=0)
+        checks.integer("steps", self.steps, 1, 10**6)
+        checks.number("learning_rate", self.learning_rate, above=0, at_most=10)
+        checks.number("tolerance", self.tolerance, at_least=0, below=1)
+
+
+class ConstrainedRates(nn.Module):
+    """Q with no negative rate between bands and rows that sum to zero, whatever its parameter."""
+
+    def __init__(self, rates: Tensor) -> None:
+        super().__init__()
+        off = rates - torch.diag(rates.diagonal())
+        self.scale = off.abs().mean().clamp(min=1e-12)
+        off = (off / self.scale).clamp(min=1e-3)
+        self.raw = nn.Parameter(off + torch.log(-torch.expm1(-off)))  # the inverse of softplus
+
+    def forward(self) -> Tensor:
+        off = nn.functional.softplus(self.raw) * self.scale
+        off = off - torch.diag(off.diagonal())
+        return off - torch.diag(off.sum(-1))
+
+
+class FreeRates(nn.Module):
+    """Q itself, in units of its typical size."""
+
+    def __init__(self, rates: Tensor) -> None:
+        super().__init__()
+        self.scale = (rates - torch.diag(rates.diagonal())).abs().mean().clamp(min=1e-12)
+        self.raw = nn.Parameter(rates / self.scale)
+
+    def forward(self) -> Tensor:
+        return self.raw * self.scale
+
+
+def fit_rates(
+    times: Tensor, mean: Tensor, basis: Tensor, initial: Tensor, settings: AdamSettings, progress: Any = None
+) -> tuple[Tensor, dict[str, Any]]:
+    """Minimize the squared difference between Pi + (I - Pi) exp(Q t) and the ensemble over all times.
+
+    Deterministic: it starts from ``initial`` and draws no random number.
+
+    Args:
+        times: (time,).
+        mean: [source, time, receiver].
+        basis: Pi [source, receiver].
+        initial: Q to start from.
+        settings: see :class:`AdamSettings`.
+        progress: called with 1 after every step.
+
+    Returns:
+        Q [source, receiver] of the smallest loss, and a report: converged, steps, loss, penalty.
+    """
+    target = mean.transpose(0, 1)
+    rest = torch.eye(len(basis), dtype=basis.dtype) - basis
+    module: nn.Module = (ConstrainedRates if settings.constraint == "exact" else FreeRates)(initial)
+    optimizer = torch.optim.Adam(module.parameters(), lr=settings.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+        optimizer, settings.steps, eta_min=settings.learning_rate / 50
+    )
+    losses: list[float] = []
+    best, best_rates = float("inf"), initial
+    converged = False
+    for _ in range(settings.steps):
+        rates = module()
+        misfit = (basis + rest @ exponentials(rates, times) - target).square().sum(-1).mean()
+        leak = rates.sum(-1).square().mean()
+        loss = misfit + (settings.penalty * leak if settings.constraint == "penalty" else 0.0)
+        value = float(loss.detach())
+        if value < best:
+            best, best_rates = value, rates.detach().clone()
+        losses.append(value)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if progress is not None:
+            progress(1)
+        if len(losses) > 100 and min(losses[:-50]) - best < settings.tolerance * best:
+            converged = True
+            break
+    return best_rates, {"converged": converged, "steps": len(losses), "loss": best, "first_loss": losses[0]}

@@ -1,0 +1,107 @@
+"""Rate models: how the energy of each band flows to the others, from the paper's (Q, Psi) upward (Eqs. 47-51)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torchchain import checks
+
+
+@dataclass(frozen=True, eq=False)
+class Embedding:
+    """A model as a linear differential equation: y(0) = e(0) start, dy/dt = y generator, e = y readout.
+
+    Attributes:
+        start: (band, state).
+        generator: (state, state).
+        readout: (state, band).
+    """
+
+    start: Tensor
+    generator: Tensor
+    readout: Tensor
+
+
+class RateModel(nn.Module):
+    """Transfer T(t) = Pi e^(-D t) + (I - Pi) exp((Q - D) t) between bands: e(t) = e(0) T(t), row vectors.
+
+    Of the energy that starts in band s the share Pi[s, r] stays in band r for good (the basis energy e0 of Eq. 48);
+    the rest moves with the rates Q and is conserved where the rows of Q sum to zero; D = diag(d) drains both (Eq. 51).
+    The paper's model has Pi = diag(Psi) (Eq. 47).
+
+    Args:
+        rates: Q [source, receiver], per unit time.
+        basis: Pi [source, receiver], or its diagonal [band].
+        damping: d [band], per unit time; None for no dissipation.
+
+    Raises:
+        FieldError: for a shape that does not fit, a value that is not finite, a basis row with a sum above 1.
+    """
+
+    kind = "markov"
+
+    def __init__(self, rates: Tensor, basis: Tensor, damping: Tensor | None = None) -> None:
+        super().__init__()
+        rates = checks.real_tensor("rates", rates)
+        if rates.ndim != 2 or rates.shape[0] != rates.shape[1] or not len(rates):
+            raise checks.fail("rates", "be a square matrix", f"shape {tuple(rates.shape)}")
+        n = len(rates)
+        basis = checks.real_tensor("basis", basis)
+        basis = torch.diag(basis) if basis.ndim == 1 else basis
+        damping = torch.zeros_like(rates[0]) if damping is None else checks.real_tensor("damping", damping)
+        for field, value, shape in (("basis", basis, (n, n)), ("damping", damping, (n,))):
+            if tuple(value.shape) != shape:
+                raise checks.fail(field, f"have shape {shape} like the rates", f"shape {tuple(value.shape)}")
+        checks.first_bad("damping", "not be negative", damping, damping < 0, "band")
+        total = basis.sum(-1)
+        checks.first_bad("basis", "have row sums of at most 1", total, total > 1 + 1e-6, "band")
+        self.rates = nn.Parameter(rates.detach().clone())
+        self.register_buffer("basis", basis.detach().clone())
+        self.register_buffer("damping", damping.detach().clone())
+        self.basis: Tensor
+        self.damping: Tensor
+
+    @property
+    def n_bands(self) -> int:
+        return len(self.rates)
+
+    @property
+    def n_parameters(self) -> int:
+        """Free numbers in the model: all of Q, and the basis where it is a matrix of its own."""
+        diagonal = torch.diag(self.basis.diagonal())
+        return self.n_bands**2 + (0 if torch.equal(diagonal, self.basis) else self.n_bands**2)
+
+    def embedding(self) -> Embedding:
+        """Free energy and basis energy side by side: (I - Pi, Pi) decaying by Q - D and -D."""
+        eye = torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device)
+        drain = torch.diag(self.damping)
+        return Embedding(
+            torch.cat([eye - self.basis, self.basis], dim=1),
+            torch.block_diag(self.rates - drain, -drain),
+            torch.cat([eye, eye]),
+        )
+
+    def transfer(self, times: Tensor) -> Tensor:
+        """T(t) by the matrix exponential, (time, source, receiver)."""
+        eye = torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device)
+        flow = exponentials(self.rates - torch.diag(self.damping), times)
+        return self.basis * torch.exp(-times[:, None, None] * self.damping) + (eye - self.basis) @ flow
+
+
+def exponentials(generator: Tensor, times: Tensor) -> Tensor:
+    """exp(generator t) at each time, (time, state, state).
+
+    On a regular grid one matrix exponential and products that double the number of times; else one per time.
+    """
+    steps = times.diff()
+    if len(times) > 2 and bool((steps - steps.mean()).abs().max() <= 1e-12 * times[-1]):
+        power = torch.linalg.matrix_exp(generator * steps.mean())
+        flow = torch.linalg.matrix_exp(generator * times[0])[None]
+        while len(flow) < len(times):
+            flow = torch.cat([flow, flow @ power])[: len(times)]
+            power = power @ power
+        return flow
+    return torch.linalg.matrix_exp(generator * times[:, None, None])

@@ -1,0 +1,126 @@
+"""Solvers of the master equation behind one registry: the matrix exponential and every method of torchdiffeq."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torchdiffeq
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.master.model import RateModel
+
+ADAPTIVE = ("dopri8", "dopri5", "bosh3", "fehlberg2", "adaptive_heun")
+FIXED = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams", "fixed_adams")
+ORDERS = {
+    "dopri8": 8, "dopri5": 5, "bosh3": 3, "fehlberg2": 2, "adaptive_heun": 2,
+    "euler": 1, "midpoint": 2, "heun2": 2, "heun3": 3, "rk4": 4,
+}  # fmt: skip
+STABILITY = {"euler": 2.0, "midpoint": 2.0, "heun2": 2.0, "heun3": 2.5127453266, "rk4": 2.7852935634}
+"""Largest |lambda| step on the negative real axis: where the stability polynomial sum z^k / k! leaves [-1, 1]."""
+
+
+class IntegrationError(RuntimeError):
+    """A solver could not reach the end of the time span."""
+
+
+@dataclass(frozen=True)
+class Solver:
+    """One way to solve the master equation.
+
+    ``run(model, initial, times, **options)`` takes initial (*batch, band) and returns (*batch, time, band).
+    """
+
+    name: str
+    run: Callable[..., Tensor]
+    summary: str
+    options: tuple[str, ...] = ()
+
+
+def expm(model: RateModel, initial: Tensor, times: Tensor) -> Tensor:
+    """The matrix exponential: exact at every time."""
+    return torch.einsum("...s,tsr->...tr", initial, model.transfer(times))
+
+
+def largest_over_members(error: Tensor) -> Tensor:
+    """Norm for error control: the root mean square of the worst member, not diluted by the rest of the batch."""
+    return error.reshape(-1, error.shape[-1]).square().mean(-1).sqrt().max()
+
+
+def _ode(method: str) -> Callable[..., Tensor]:
+    adaptive, scipy = method in ADAPTIVE, method == "scipy_solver"
+
+    def run(
+        model: RateModel,
+        initial: Tensor,
+        times: Tensor,
+        rtol: float = 1e-8,
+        atol: float = 1e-10,
+        step: float | None = None,
+        solver: str = "LSODA",
+    ) -> Tensor:
+        parts = model.embedding()
+        start = initial @ parts.start
+
+        def slope(t: Tensor, y: Tensor) -> Tensor:
+            return y @ parts.generator
+
+        rtol = checks.number("rtol", rtol, above=0, below=1)
+        atol = checks.number("atol", atol, above=0)
+        options: dict[str, Any]
+        if scipy:
+            options = {"solver": checks.choice("solver", solver, ("RK45", "RK23", "DOP853", "Radau", "BDF", "LSODA"))}
+        elif adaptive:
+            options = {"norm": largest_over_members}
+        else:
+            options = {"step_size": _checked_step(method, parts.generator, step)}
+        span = times if float(times[0]) == 0.0 else torch.cat([times.new_zeros(1), times])
+        if len(span) == 1:  # only time 0 is asked for
+            path = start[None]
+        else:
+            try:
+                with warnings.catch_warnings():
+                    warnings.filterwarnings("error", message=".*[Ff]unctional iteration did not converge.*")
+                    path = torchdiffeq.odeint(slope, start, span, rtol=rtol, atol=atol, method=method, options=options)
+            except (AssertionError, UserWarning) as error:
+                raise IntegrationError(
+                    f"solver '{method}' must reach time {float(times[-1]):g} with rtol {rtol:g} and atol {atol:g} "
+                    f"in {start.dtype}, got: {error}"
+                ) from None
+        path = path[-len(times) :]
+        if not bool(torch.isfinite(path).all()):
+            raise IntegrationError(f"solver '{method}' must stay finite, got overflow before time {float(times[-1]):g}")
+        return torch.movedim(path @ parts.readout, 0, -2)
+
+    return run
+
+
+def _checked_step(method: str, generator: Tensor, step: float | None) -> float:
+    """The step to use: given and stable, or half the stability limit."""
+    fastest = float(torch.linalg.eigvals(generator.detach()).abs().max())
+    reach = STABILITY.get(method, 1.0)
+    limit = reach / fastest if fastest > 0 else float("inf")
+    if step is None:
+        return min(limit / 2, 1.0)
+    step = checks.number("step", step, above=0)
+    if method in STABILITY and step > limit * (1 + 1e-9):
+        raise checks.fail(
+            "step",
+            f"be at most {limit:.6g} for '{method}' (|lambda| step <= {reach:.4g}, fastest rate {fastest:.4g})",
+            step,
+        )
+    return step
+
+
+SOLVERS: dict[str, Solver] = {
+    "expm": Solver("expm", expm, "matrix exponential, exact"),
+    **{name: Solver(name, _ode(name), "torchdiffeq, adaptive step", ("rtol", "atol")) for name in ADAPTIVE},
+    **{name: Solver(name, _ode(name), "torchdiffeq, fixed step", ("step",)) for name in FIXED},
+    "scipy_solver": Solver(
+        "scipy_solver", _ode("scipy_solver"), "torchdiffeq, SciPy's solvers", ("rtol", "atol", "solver")
+    ),
+}
