@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchchain import checks
-from torchchain.master.model import exponentials
+from torchchain.master.model import flows
 
 CONSTRAINTS = ("exact", "penalty")
 
@@ -29,8 +29,8 @@ class AdamSettings:
 
     constraint: str = "exact"
     penalty: float = 10.0
-    steps: int = 600
-    learning_rate: float = 0.03
+    steps: int = 2000
+    learning_rate: float = 0.3
     tolerance: float = 1e-4
 
     def __post_init__(self) -> None:
@@ -87,7 +87,6 @@ def fit_rates(
     Returns:
         Q [source, receiver] of the smallest loss, and a report: converged, steps, loss, penalty.
     """
-    target = mean.transpose(0, 1)
     rest = torch.eye(len(basis), dtype=basis.dtype) - basis
     module: nn.Module = (ConstrainedRates if settings.constraint == "exact" else FreeRates)(initial)
     optimizer = torch.optim.Adam(module.parameters(), lr=settings.learning_rate)
@@ -99,7 +98,7 @@ def fit_rates(
     converged = False
     for _ in range(settings.steps):
         rates = module()
-        misfit = (basis + rest @ exponentials(rates, times) - target).square().sum(-1).mean()
+        misfit = (basis[:, None] + flows(rest, rates, times) - mean).square().sum(-1).mean()
         leak = rates.sum(-1).square().mean()
         loss = misfit + (settings.penalty * leak if settings.constraint == "penalty" else 0.0)
         value = float(loss.detach())

@@ -18,6 +18,7 @@ from torchchain.master.adam import AdamSettings, fit_rates
 from torchchain.master.equation import Calibration, MasterEquation
 from torchchain.master.fits import FitWarning, analytic_prefactor, linear_rates, nonlinear_rates, profile
 from torchchain.master.model import RateModel
+from torchchain.threads import single_thread
 from torchchain.wavenumber import basis_fraction
 
 LINEAR_WINDOW = (0.5, 2.0)
@@ -118,7 +119,7 @@ def calibrate(
                 stacklevel=2,
             )
     else:
-        with _bar(progress, adam_settings.steps, "step") as bar:
+        with _bar(progress, adam_settings.steps, "step") as bar, single_thread():
             rates, report = fit_rates(transfer.times, transfer.mean, basis, linear, adam_settings, bar and bar.update)
         report |= {"constraint": adam_settings.constraint, "penalty": adam_settings.penalty}
         if not report["converged"]:

@@ -14,6 +14,7 @@ from torchchain.master import artifact
 from torchchain.master.model import RateModel
 from torchchain.master.solvers import SOLVERS
 from torchchain.scene import Scene
+from torchchain.threads import single_thread
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,8 @@ class MasterEquation(nn.Module):
         initial = checks.real_tensor("initial", initial).to(self.rates)
         if initial.ndim == 0 or initial.shape[-1] != self.n_bands:
             raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}")
-        return solver.run(self.model, initial, checks.times("times", times).to(self.rates), **options)
+        with single_thread():
+            return solver.run(self.model, initial, checks.times("times", times).to(self.rates), **options)
 
     def forward(self, initial: Tensor, times: Tensor) -> Tensor:
         """:meth:`solve` by the matrix exponential."""

@@ -84,24 +84,34 @@ class RateModel(nn.Module):
             torch.cat([eye, eye]),
         )
 
+    def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
+        """e(t) by the matrix exponential, (*batch, time, band), from initial (*batch, band)."""
+        resting = (initial @ self.basis)[..., None, :]
+        if bool(self.damping.any()):
+            resting = resting * torch.exp(-times[:, None] * self.damping)
+        flow = self.rates - torch.diag(self.damping)
+        return resting + flows(initial - initial @ self.basis, flow, times)
+
     def transfer(self, times: Tensor) -> Tensor:
-        """T(t) by the matrix exponential, (time, source, receiver)."""
-        eye = torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device)
-        flow = exponentials(self.rates - torch.diag(self.damping), times)
-        return self.basis * torch.exp(-times[:, None, None] * self.damping) + (eye - self.basis) @ flow
+        """T(t), (source, time, receiver): the propagation of a unit energy in each band."""
+        return self.propagate(torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device), times)
 
 
-def exponentials(generator: Tensor, times: Tensor) -> Tensor:
-    """exp(generator t) at each time, (time, state, state).
+def flows(start: Tensor, generator: Tensor, times: Tensor) -> Tensor:
+    """start exp(generator t) at each time, (*batch, time, state), from start (*batch, state).
 
-    On a regular grid one matrix exponential and products that double the number of times; else one per time.
+    On a regular grid one matrix exponential, its squares, and products that double the number of times each;
+    else one exponential per time.
     """
-    steps = times.diff()
-    if len(times) > 2 and bool((steps - steps.mean()).abs().max() <= 1e-12 * times[-1]):
-        power = torch.linalg.matrix_exp(generator * steps.mean())
-        flow = torch.linalg.matrix_exp(generator * times[0])[None]
-        while len(flow) < len(times):
-            flow = torch.cat([flow, flow @ power])[: len(times)]
-            power = power @ power
-        return flow
-    return torch.linalg.matrix_exp(generator * times[:, None, None])
+    count = len(times)
+    step = (times[-1] - times[0]) / max(1, count - 1)
+    regular = times[0] + step * torch.arange(count, dtype=times.dtype, device=times.device)
+    if count < 3 or bool((times - regular).abs().max() > 1e-12 * times[-1]):
+        return torch.einsum("...s,tsr->...tr", start, torch.linalg.matrix_exp(generator * times[:, None, None]))
+    if float(times[0]) > 0:
+        start = start @ torch.linalg.matrix_exp(generator * times[0])
+    path, power = start[..., None, :], torch.linalg.matrix_exp(generator * step)
+    while path.shape[-2] < count:
+        path = torch.cat([path, path[..., : count - path.shape[-2], :] @ power], dim=-2)
+        power = power @ power
+    return path
