@@ -24,10 +24,11 @@ from torchchain.excitation import Impulse, StandingWave, State
 from torchchain.scene import Scene
 from torchchain.spectrum import NormalModes, normal_modes
 from torchchain.statistics import Moments, MomentTree
+from torchchain.threads import map_in_order
 from torchchain.wavenumber import band_energy, long_time_band_energy, wavenumber_energy
 
 MEMORY_BUDGET = 2**29
-CACHE_FRIENDLY = 2**26  # states of a chunk beyond this size cost more per byte: page faults
+CACHE_FRIENDLY = 2**25  # states of a chunk beyond this size cost more per byte: page faults
 BLOCKS = 20
 
 
@@ -76,9 +77,10 @@ IN_TIME: dict[str, Observable] = {
 
 
 class Stages:
-    """Seconds spent in each named stage of a run."""
+    """Seconds spent in each named stage of a run; work on several threads counts its share of the time."""
 
-    def __init__(self) -> None:
+    def __init__(self, share: float = 1.0) -> None:
+        self.share = share
         self.seconds: dict[str, float] = {}
 
     @contextmanager
@@ -87,7 +89,12 @@ class Stages:
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+            self.add({name: self.share * (time.perf_counter() - begin)})
+
+    def add(self, seconds: dict[str, float]) -> None:
+        """Take in the seconds of other stages."""
+        for name, value in seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + value
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +136,7 @@ class Chunk:
 
 def stream(
     scene: Scene,
+    measure: Callable[[Chunk], dict[str, Tensor]],
     method: str = "auto",
     *,
     device: str | torch.device = "cpu",
@@ -136,58 +144,63 @@ def stream(
     progress: bool = False,
     stages: Stages | None = None,
     options: dict[str, Any] | None = None,
-) -> Iterator[Chunk]:
-    """The realizations of a scene in chunks that keep to a memory budget.
+) -> Iterator[tuple[int, dict[str, Tensor]]]:
+    """Measure the realizations of a scene in chunks that keep to a memory budget, in order.
 
-    An ordered scene is one chain however many realizations it asks for, and yields that one alone.
+    An ordered scene is one chain however many realizations it asks for, and that one is measured alone. On the CPU
+    chunks run side by side, one thread each.
 
     Args:
         scene: what is wanted.
+        measure: from a chunk to named tensors (realization, ...); called on several threads.
         method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
         device: where the chains are computed.
-        memory_budget: bytes for a chunk's states and modes; times are cut into windows where one chain exceeds it.
+        memory_budget: bytes for all chunks under way; times are cut into windows where one chain exceeds it.
         progress: show a bar if the output is a terminal.
         stages: collects seconds per stage.
         options: the method's own.
+
+    Yields:
+        The first realization of the chunk, counted from 0, and its measurements on the CPU, with the masses'
+        first two moments under "mass_moments".
     """
     options = dict(options or {})
     if method == "auto":
         plan = planning.plan(scene)
         method, options = plan.method, {**plan.options, **options}
     stages = stages or Stages()
-    budget = checks.integer("memory_budget", memory_budget, 1)
+    workers = torch.get_num_threads() if torch.device(device).type == "cpu" else 1
+    budget = checks.integer("memory_budget", memory_budget, 1) // workers
     state_bytes = 8 * max(1, len(scene.tones)) * scene.n_particles * 10  # states, phases, transforms, products
     mode_bytes = 8 * scene.n_particles**2 * 8 if method == "modes" else 0
     realizations = 1 if scene.is_ordered else scene.realizations
     window = max(1, min(len(scene.times), min(budget - mode_bytes, CACHE_FRIENDLY) // state_bytes))
-    size = max(1, min(realizations, min(budget, mode_bytes + CACHE_FRIENDLY) // (mode_bytes + state_bytes * window)))
+    size = max(1, min(budget, mode_bytes + CACHE_FRIENDLY) // (mode_bytes + state_bytes * window))
+    size = min(size, -(-realizations // workers))
     times = scene.times.to(device)
+
+    def work(numbers: range) -> tuple[range, dict[str, Tensor], dict[str, float]]:
+        spent = Stages(1 / workers)
+        with spent("masses"):
+            chain = scene.chain(numbers, device)
+            state = scene.state(chain)
+        measured = measure(Chunk(scene, numbers[0], chain, state, method, options, times, window, spent))
+        moments = torch.stack([chain.masses.mean(-1), chain.masses.square().mean(-1)], dim=-1)
+        measured = {"mass_moments": moments, **measured}
+        return numbers, {name: values.cpu() for name, values in measured.items()}, spent.seconds
+
+    chunks = [range(first, min(first + size, realizations)) for first in range(0, realizations, size)]
     with tqdm(total=realizations, unit="chain", disable=None if progress else True, leave=False) as bar:
-        for first in range(0, realizations, size):
-            numbers = range(first, min(first + size, realizations))
-            with stages("masses"):
-                chain = scene.chain(numbers, device)
-                state = scene.state(chain)
-            yield Chunk(scene, first, chain, state, method, options, times, window, stages)
+        for numbers, measured, seconds in map_in_order(work, chunks, workers):
+            stages.add(seconds)
+            yield numbers[0], measured
             bar.update(len(numbers))
 
 
-class MassStatistics:
-    """Realized mean and standard deviation of the masses of an ensemble."""
-
-    def __init__(self) -> None:
-        self.tree = MomentTree()
-
-    def add(self, chunk: Chunk) -> None:
-        """Take in a chunk's masses."""
-        masses = chunk.chain.masses
-        self.tree.add(chunk.first, torch.stack([masses.mean(-1), masses.square().mean(-1)], dim=-1).cpu())
-
-    @property
-    def realized(self) -> dict[str, float]:
-        """``mass_mean`` and ``mass_sd`` over all particles of all realizations."""
-        mean, square = self.tree.result().mean.tolist()
-        return {"mass_mean": mean, "mass_sd": max(0.0, square - mean**2) ** 0.5}
+def realized_masses(moments: Moments) -> dict[str, float]:
+    """``mass_mean`` and ``mass_sd`` over all particles of all realizations."""
+    mean, square = moments.mean.tolist()
+    return {"mass_mean": mean, "mass_sd": max(0.0, square - mean**2) ** 0.5}
 
 
 def simulate(
@@ -213,25 +226,35 @@ def simulate(
         A single realization of a disordered chain has the standard error infinity.
     """
     stages = stages or Stages()
-    trees = {name: MomentTree() for name in scene.observables}
-    masses = MassStatistics()
     in_time = [name for name in scene.observables if name in IN_TIME]
-    for chunk in stream(
-        scene, method, device=device, memory_budget=memory_budget, progress=progress, stages=stages, options=options
-    ):
+
+    def measure(chunk: Chunk) -> dict[str, Tensor]:
         parts: dict[str, list[Tensor]] = {name: [] for name in in_time}
         for trajectory in chunk.trajectories() if in_time else ():
-            with stages("observables"):
+            with chunk.stages("observables"):
                 for name in in_time:
                     parts[name].append(IN_TIME[name].of(scene, chunk.chain, trajectory))
+        measured = {name: torch.cat(parts[name], dim=-len(IN_TIME[name].axes)) for name in in_time}
+        if "long_time_band_energy" in scene.observables:
+            measured["long_time_band_energy"] = chunk.long_time()
+        return measured
+
+    trees = {name: MomentTree() for name in ("mass_moments", *scene.observables)}
+    for first, measured in stream(
+        scene,
+        measure,
+        method,
+        device=device,
+        memory_budget=memory_budget,
+        progress=progress,
+        stages=stages,
+        options=options,
+    ):
         with stages("statistics"):
-            masses.add(chunk)
-            for name in in_time:
-                time_axis = -len(IN_TIME[name].axes)
-                trees[name].add(chunk.first, torch.cat(parts[name], dim=time_axis).cpu())
-        if "long_time_band_energy" in trees:
-            trees["long_time_band_energy"].add(chunk.first, chunk.long_time().cpu())
-    return _dataset(scene, {name: tree.result() for name, tree in trees.items()}, masses.realized)
+            for name, tree in trees.items():
+                tree.add(first, measured[name])
+    masses = realized_masses(trees.pop("mass_moments").result())
+    return _dataset(scene, {name: tree.result() for name, tree in trees.items()}, masses)
 
 
 def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, Any]) -> xarray.Dataset:
@@ -400,25 +423,36 @@ def band_transfer(
     n_blocks = min(BLOCKS, realizations)
     edges = [realizations * b // n_blocks for b in range(n_blocks + 1)]
     trees = [(MomentTree(), MomentTree()) for _ in range(n_blocks)]
-    masses = MassStatistics()
-    for chunk in stream(
-        scene, method, device=device, memory_budget=memory_budget, progress=progress, stages=stages, options=options
-    ):
+    masses = MomentTree()
+
+    def measure(chunk: Chunk) -> dict[str, Tensor]:
         parts = []
         for trajectory in chunk.trajectories():
-            with stages("band energies"):
+            with chunk.stages("band energies"):
                 parts.append(IN_TIME["band_energy"].of(scene, chunk.chain, trajectory))
-        average = chunk.long_time().cpu() if long_time else None
+        measured = {"band_energy": torch.cat(parts, dim=-2)}
+        return measured | ({"long_time": chunk.long_time()} if long_time else {})
+
+    for first, measured in stream(
+        scene,
+        measure,
+        method,
+        device=device,
+        memory_budget=memory_budget,
+        progress=progress,
+        stages=stages,
+        options=options,
+    ):
         with stages("statistics"):
-            masses.add(chunk)
-            values = torch.cat(parts, dim=-2).cpu()
+            masses.add(first, measured["mass_moments"])
+            values = measured["band_energy"]
             for block, (in_time, at_end) in enumerate(trees):
-                begin, end = max(edges[block], chunk.first), min(edges[block + 1], chunk.first + len(values))
+                begin, end = max(edges[block], first), min(edges[block + 1], first + len(values))
                 if begin < end:
-                    part = slice(begin - chunk.first, end - chunk.first)
+                    part = slice(begin - first, end - first)
                     in_time.add(begin - edges[block], values[part])
-                    if average is not None:
-                        at_end.add(begin - edges[block], average[part])
+                    if long_time:
+                        at_end.add(begin - edges[block], measured["long_time"][part])
     blocks = [in_time.result() for in_time, _ in trees]
     total = _merged(blocks)
     ends = [at_end.result() for _, at_end in trees] if long_time else []
@@ -433,7 +467,7 @@ def band_transfer(
         torch.stack([block.mean for block in blocks]),
         torch.stack([block.mean for block in ends]) if ends else None,
         tuple(block.count for block in blocks),
-        dict(masses.realized),
+        realized_masses(masses.result()),
     )
 
 

@@ -8,6 +8,7 @@ is differentiable and runs on any device, and a numba loop for CPU tensors that 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -55,10 +56,8 @@ def damping_rate(chain: Chain) -> Tensor:
     """An upper bound on the eigenvalues of M^-1 D, (*batch,)."""
     with torch.no_grad():
         damping = chain.contact_damping
-        floor = 1e-12 * damping.amax(-1, keepdim=True)
-        if not bool((floor > 0).all()):
-            floor = floor + torch.finfo(damping.dtype).tiny ** 0.5
-        as_stiffness = torch.maximum(damping, floor)
+        # The bound for stiffness serves; a contact without damping gets as little as makes no difference.
+        as_stiffness = damping.clamp(min=1e-12 * damping.amax().item())
         return replace(chain, stiffness=as_stiffness, contact="linear", damping=0.0).squared_frequency_bound()
 
 
@@ -91,20 +90,25 @@ def checked_step(chain: Chain, state: State, composition: Composition, method: s
         default = composition.default / highest_frequency(chain, largest_overlap(chain, state))
         return (default if damping is None else torch.minimum(default, 0.5 / damping)).amin().item()
     step = checks.number("step", step, above=0)
-    limits = [("w_max", composition.limit, highest_frequency(chain, initial_overlap(chain, state)))]
+    rates = [("w_max", composition.limit, highest_frequency(chain, initial_overlap(chain, state)))]
     if damping is not None:
-        limits.append(("the largest eigenvalue of M^-1 D, which is", 2.0, damping))
-    for name, bound, rate in limits:
-        largest = rate.amax()
-        if not step * largest.item() < bound:
+        rates.append(("d_max", 2.0, damping))
+    check_limits(step, method, rates)
+    return step
+
+
+def check_limits(step: float, method: str, rates: Sequence[tuple[str, float | None, Tensor]]) -> None:
+    """An error where the step times a rate reaches its limit; ``rates`` are (name, limit or None, value (*batch,))."""
+    for name, limit, rate in rates:
+        largest = rate.amax().item()
+        if limit is not None and not step * largest < limit:
             where = tuple(int(i) for i in (rate == largest).nonzero()[0])
             raise checks.fail(
                 "step",
-                f"be less than {bound / largest.item():.6g}, the stability limit {bound:.6g} / w of method "
-                f"'{method}' with w = {name} {largest.item():.6g}{checks.position(where)}".replace("w = w_max", "w_max ="),
+                f"be less than {limit / largest:.6g}, the stability limit {limit:.6g} / {name} of method '{method}' "
+                f"with {name} = {largest:.6g}{checks.position(where)}",
                 step,
             )
-    return step
 
 
 def substeps(now: float, times: list[float], step: float) -> list[int]:
@@ -198,8 +202,14 @@ def _tensors(chain: Chain, state: State, composition: Composition, step: float) 
             if hertz:
                 peak = torch.maximum(peak, chain.elongation(displacement.detach()))
             outputs.append((displacement, velocity, lost, (peak >= 1).sum(-1)))
-        series = [torch.stack(part, dim=chain_axis) for part, chain_axis in zip(zip(*outputs), (-2, -2, -1, -1))]
-        return Trajectory(times, series[0], series[1], series[2] if damped else None, series[3] if hertz else None)
+        displacements, velocities, losses, openings = zip(*outputs, strict=True)
+        return Trajectory(
+            times,
+            torch.stack(displacements, dim=-2),
+            torch.stack(velocities, dim=-2),
+            torch.stack(losses, dim=-1) if damped else None,
+            torch.stack(openings, dim=-1) if hertz else None,
+        )
 
     return advance
 
@@ -228,8 +238,8 @@ def _rows(chain: Chain, state: State, composition: Composition, step: float) -> 
         nonlocal now
         targets = _targets(times, now)
         counts = substeps(now, targets, step)
-        spans = [target - before for before, target in zip([now, *targets], targets)]
-        steps = torch.tensor([span / max(count, 1) for span, count in zip(spans, counts)], dtype=dtype)
+        spans = [target - before for before, target in zip([now, *targets[:-1]], targets, strict=True)]
+        steps = torch.tensor([span / max(count, 1) for span, count in zip(spans, counts, strict=True)], dtype=dtype)
         rows, window = len(displacement), len(targets)
         out = [torch.empty(rows, window, n, dtype=dtype) for _ in range(2)]
         losses = torch.empty(rows, window, dtype=dtype)

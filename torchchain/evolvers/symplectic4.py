@@ -16,7 +16,7 @@ PEFRL = symplectic.Composition(
     opening=(XI, 0.5 - LAMBDA),
     middle=((CHI, LAMBDA), (1 - 2 * (CHI + XI), LAMBDA), (CHI, 0.5 - LAMBDA)),
     closing=(XI, 0.0),
-    limit=2.98962,
+    limit=2.98944,
     default=0.4,
 )
 
@@ -32,7 +32,7 @@ METHOD = Method(
     summary="the position extended Forest-Ruth-like composition (Omelyan, Mryglod and Folk 2002), four forces per step",
     order="4; the phase error of a mode grows as 6e-5 w^5 step^4 t",
     conserves="a nearby energy exactly, so that the energy of linear chains only swings; momentum",
-    stability="w_max step < 2.98962, where the trace of its step on an oscillator first leaves [-2, 2]; "
+    stability="w_max step < 2.98944, where the trace of its step on an oscillator first leaves [-2, 2]; "
     "Hertz contacts: w_max grows with the fourth root of the overlap, and the energy is watched",
     cost="four forces per step, N each; no memory beyond the states",
     cannot="damping (its negative substeps would amplify); Hertz contacts lower the order when contacts open",

@@ -56,29 +56,32 @@ def _kick(displacement, velocity, duration, weight, stiffness, hertz, tension, p
     _wrap(velocity, periodic)
 
 
-@_compile
-def _damp(displacement, velocity, duration, weight, damping, hertz, force, middle, periodic):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _damp(displacement, velocity, duration, weight, damping, hertz, active, force, middle, periodic):  # type: ignore[no-untyped-def]
     """Contact damping over the duration by the explicit midpoint rule; returns the kinetic energy it takes."""
     n = weight.shape[0]
     half = weight.dtype.type(0.5)
     one = weight.dtype.type(1)
+    zero = weight.dtype.type(0)
+    if hertz:
+        for c in range(n + 1):
+            active[c] = damping[c] if displacement[c + 1] - displacement[c] < one else zero
+    else:
+        active = damping
     for c in range(n + 1):
-        force[c] = damping[c] * (velocity[c + 1] - velocity[c])
-        if hertz and displacement[c + 1] - displacement[c] >= one:
-            force[c] = 0
+        force[c] = active[c] * (velocity[c + 1] - velocity[c])
     for i in range(n):
         middle[i + 1] = velocity[i + 1] + half * duration * weight[i] * (force[i + 1] - force[i])
     _wrap(middle, periodic)
     for c in range(n + 1):
-        force[c] = damping[c] * (middle[c + 1] - middle[c])
-        if hertz and displacement[c + 1] - displacement[c] >= one:
-            force[c] = 0
-    work = weight.dtype.type(0)
+        force[c] = active[c] * (middle[c + 1] - middle[c])
+    work = zero
     for i in range(n):
         pull = duration * (force[i + 1] - force[i])
         before = velocity[i + 1]
-        velocity[i + 1] = before + weight[i] * pull
-        work += pull * half * (before + velocity[i + 1])
+        after = before + weight[i] * pull
+        velocity[i + 1] = after
+        work += pull * half * (before + after)
     _wrap(velocity, periodic)
     return -work
 
@@ -96,13 +99,14 @@ def _advance_row(  # type: ignore[no-untyped-def]
     _wrap(u, periodic)
     _wrap(v, periodic)
     tension = np.zeros(n + 1, weight.dtype)
-    buffer = np.zeros(n + 2, weight.dtype)
+    active = np.zeros(n + 1, weight.dtype)
+    middle_velocity = np.zeros(n + 2, weight.dtype)
     half = weight.dtype.type(0.5)
     for t in range(substeps.shape[0]):
         h = steps[t]
         if substeps[t] > 0:
             if damped:
-                lost += _damp(u, v, half * h, weight, damping, hertz, tension, buffer, periodic)
+                lost += _damp(u, v, half * h, weight, damping, hertz, active, tension, middle_velocity, periodic)
             drift, kick = opening[0], opening[1]
             for step in range(substeps[t]):
                 last = step + 1 == substeps[t]
@@ -123,7 +127,18 @@ def _advance_row(  # type: ignore[no-untyped-def]
                 if kick != 0:
                     _kick(u, v, kick * h, weight, stiffness, hertz, tension, peak, periodic)
                 if damped:
-                    lost += _damp(u, v, half * h if last else h, weight, damping, hertz, tension, buffer, periodic)
+                    lost += _damp(
+                        u,
+                        v,
+                        half * h if last else h,
+                        weight,
+                        damping,
+                        hertz,
+                        active,
+                        tension,
+                        middle_velocity,
+                        periodic,
+                    )
         displacements[t] = u[1:-1]
         velocities[t] = v[1:-1]
         losses[t] = lost

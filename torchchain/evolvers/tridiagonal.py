@@ -31,7 +31,9 @@ def start(chain: Chain, state: State) -> Advance:
     """See the registry entry below."""
     for field in ("masses", "stiffness"):
         if torch.as_tensor(getattr(chain, field)).requires_grad:
-            raise checks.fail(field, "not require a gradient for method 'tridiagonal' (use 'modes')", "requires_grad=True")
+            raise checks.fail(
+                field, "not require a gradient for method 'tridiagonal' (use 'modes')", "requires_grad=True"
+            )
     return modes.start(chain, state, checked_modes(chain, vectors(chain)))
 
 

@@ -1,0 +1,243 @@
+"""The torchchain command: typed flags, read before anything heavy is imported."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import tyro
+
+DESCRIPTION = """Wave energy in disordered granular chains: exact ensembles, and the master equation calibrated from them.
+A flag overrides the config file, the config file overrides the defaults, which are the paper's case."""
+
+
+@dataclass(frozen=True)
+class DisorderFlags:
+    """Disorder of the masses."""
+
+    kind: str | None = None
+    """normal (default), uniform, binary, lognormal or gamma"""
+    strength: float | None = None
+    """standard deviation xi in mean masses (default 0.3)"""
+    lower: float | None = None
+    """masses below this are drawn again (default 0.05)"""
+
+
+@dataclass(frozen=True)
+class ExcitationFlags:
+    """How the chains are set in motion."""
+
+    kind: str | None = None
+    """standing_wave (default) or impulse"""
+    site: int | None = None
+    """impulse: particle, counted from 1 (default 1)"""
+    velocity: float | None = None
+    """impulse: initial velocity (default 0.01)"""
+    tones: tuple[int, ...] | None = None
+    """standing wave: tones, a run of its own each (default: the center tone of every band)"""
+    amplitude: float | None = None
+    """standing wave: amplitude in initial overlaps (default 0.01)"""
+    phase: str | None = None
+    """standing wave: sin (default) or cos"""
+
+
+@dataclass(frozen=True)
+class TimesFlags:
+    """Output times, in travel times of sound over one particle."""
+
+    start: float | None = None
+    """first time (default 0)"""
+    stop: float | None = None
+    """last time (default 50)"""
+    step: float | None = None
+    """step (default 0.25)"""
+
+
+@dataclass(frozen=True)
+class SceneFlags:
+    """Flags that describe a scene."""
+
+    config: str | None = None
+    """scene file (TOML)"""
+    n_particles: int | None = None
+    """particles per chain (default 256)"""
+    boundary: str | None = None
+    """periodic (default) or fixed"""
+    disorder: DisorderFlags = field(default_factory=DisorderFlags)
+    excitation: ExcitationFlags = field(default_factory=ExcitationFlags)
+    times: TimesFlags = field(default_factory=TimesFlags)
+    n_bands: int | None = None
+    """wavenumber bands (default 32)"""
+    realizations: int | None = None
+    """chains in the ensemble (default 100)"""
+    seed: int | None = None
+    """seed of the ensemble (default 0)"""
+    tolerance: float | None = None
+    """accuracy wanted; none for the ensemble's own error"""
+    observables: tuple[str, ...] | None = None
+    """what to measure (default band_energy)"""
+    contact: str | None = None
+    """linear (default) or hertz"""
+    damping: float | None = None
+    """contact damping coefficient (default 0)"""
+    energy_definition: str | None = None
+    """site (default) or bond"""
+
+    def overrides(self) -> dict[str, Any]:
+        """The flags that were given, as nested plain values."""
+        return _given(
+            self, skip=("config", "out", "device", "method", "fit", "model", "window", "constraint", "penalty")
+        )
+
+
+@dataclass(frozen=True)
+class Simulate(SceneFlags):
+    """Ensemble means of a scene's observables, with standard errors."""
+
+    out: str = "results/simulate"
+    """folder for config.toml, results.nc, figure.png and run.json"""
+    device: str = "cpu"
+    """cpu, cuda, cuda:1, ..."""
+    method: str = "auto"
+    """how to evolve the chains; auto for the plan's choice"""
+
+
+@dataclass(frozen=True)
+class Calibrate(SceneFlags):
+    """A master equation from an ensemble: data, model file, figure and its error."""
+
+    out: str = "results/calibrate"
+    """folder for config.toml, transfer.nc, model.safetensors, figure.png and run.json"""
+    device: str = "cpu"
+    """cpu, cuda, cuda:1, ..."""
+    method: str = "auto"
+    """how to evolve the chains; auto for the plan's choice"""
+    fit: str | None = None
+    """adam (default), linear, nonlinear or analytic"""
+    model: str | None = None
+    """rate model; none for the most accurate"""
+    window: tuple[float, float] | None = None
+    """first and last time of the short-time fits (default 0.5 2)"""
+    constraint: str | None = None
+    """adam: exact (default) or penalty"""
+    penalty: float | None = None
+    """adam: weight of the conservation penalty (default 10)"""
+
+    def calibration(self) -> dict[str, Any]:
+        """The flags of the fit that were given."""
+        given = {name: getattr(self, name) for name in ("model", "window", "constraint", "penalty")}
+        return {k: v for k, v in {"method": self.fit, **given}.items() if v is not None}
+
+
+@dataclass(frozen=True)
+class Predict:
+    """Band energies from a calibrated master equation."""
+
+    model: Annotated[str, tyro.conf.Positional]
+    """file written by calibrate"""
+    source: tuple[int, ...] | None = None
+    """bands that start with a unit energy, a run of its own each (default: every band)"""
+    initial: tuple[float, ...] | None = None
+    """energy of every band at the start, in place of --source"""
+    times: TimesFlags = field(default_factory=TimesFlags)
+    method: str = "expm"
+    """expm or a torchdiffeq method"""
+    config: str | None = None
+    """file (TOML) with the same keys as the flags"""
+    seed: int | None = None
+    """recorded only: a prediction draws no random number"""
+    out: str = "results/predict"
+    """folder for config.toml, results.nc, figure.png and run.json"""
+    device: str = "cpu"
+    """cpu, cuda, cuda:1, ..."""
+
+    def overrides(self) -> dict[str, Any]:
+        """The flags that were given, as nested plain values."""
+        return _given(self, skip=("model", "config", "out", "device", "method", "seed"))
+
+
+@dataclass(frozen=True)
+class Plan(SceneFlags):
+    """The cheapest way to meet a scene, with reasons and runners-up."""
+
+
+COMMANDS: dict[str, Any] = {"simulate": Simulate, "calibrate": Calibrate, "predict": Predict, "plan": Plan}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; the exit status is 2 for bad input, 1 for a failed computation, 130 for an interrupt."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        flags = _parse(arguments)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 2
+    try:
+        from torchchain import commands  # torch and the rest, once the flags are known to be good
+        from torchchain.checks import FieldError, FieldTypeError
+        from torchchain.master.solvers import IntegrationError
+        from torchchain.spectrum import DecompositionError
+
+        try:
+            return commands.run(flags, arguments)
+        except (FieldError, FieldTypeError) as error:
+            return _complain(str(error), 2)
+        except (DecompositionError, IntegrationError) as error:
+            return _complain(str(error), 1)
+    except KeyboardInterrupt:
+        return _complain("interrupted, nothing was written", 130)
+
+
+def _parse(arguments: list[str]) -> Any:
+    """The flags as a record; a mistake is one line on standard error."""
+    caught = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(caught):
+            return tyro.extras.subcommand_cli_from_dict(
+                COMMANDS,
+                args=arguments,
+                prog="torchchain",
+                description=DESCRIPTION,
+                config=(tyro.conf.CascadeSubcommandArgs,),
+            )
+    except SystemExit as stop:
+        if stop.code:
+            _complain(_one_line(caught.getvalue()), 2)
+        raise
+
+
+def _one_line(report: str) -> str:
+    """The parser's boxed report as one line: flag, rule, value."""
+    lines = [line.strip("│╭╮╰╯─ ").strip() for line in report.splitlines()]
+    text = " ".join(line for line in lines if line)
+    text = re.sub(r"\s*(For full helptext|Argument helptext|Got errors).*", "", text)
+    value = re.search(r"Error parsing (\S+): .*?no type matching (.*?) could be instantiated from \[(.*?)\]", text)
+    if value:
+        kind = value[2].replace("{None}|", "").strip("{}")
+        return f"{value[1]} must be {kind}, got {value[3]}"
+    return text
+
+
+def _complain(message: str, status: int) -> int:
+    print(f"torchchain: error: {' '.join(message.split())}", file=sys.stderr)
+    return status
+
+
+def _given(flags: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:
+    plain: dict[str, Any] = {}
+    for entry in dataclasses.fields(flags):
+        value = getattr(flags, entry.name)
+        if dataclasses.is_dataclass(value):
+            value = _given(value) or None
+        if value is not None and entry.name not in skip:
+            plain[entry.name] = value
+    return plain
+
+
+if __name__ == "__main__":
+    sys.exit(main())

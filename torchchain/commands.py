@@ -1,0 +1,337 @@
+"""What the torchchain commands do once their flags are read."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+import torch
+import xarray
+
+from torchchain import checks, outputs, planning, plots
+from torchchain.cli import Calibrate, Plan, Predict, SceneFlags, Simulate
+from torchchain.ensemble import BandTransfer, Stages, band_transfer, simulate
+from torchchain.evolvers import METHODS
+from torchchain.master import SOLVERS, MasterEquation, calibrate
+from torchchain.scene import Scene, describe, read_toml, regular_times
+from torchchain.statistics import statistical_distance, total_variation
+
+
+def run(flags: Any, arguments: list[str]) -> int:
+    """Run the command that the flags belong to; returns the exit status."""
+    if isinstance(flags, Simulate):
+        run_simulate(flags, arguments)
+    elif isinstance(flags, Calibrate):
+        run_calibrate(flags, arguments)
+    elif isinstance(flags, Predict):
+        run_predict(flags, arguments)
+    elif isinstance(flags, Plan):
+        print(planning.plan(_scene(flags)[0]))
+    return 0
+
+
+def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested tables, the second over the first; an excitation of another kind replaces the first's fields."""
+    merged = dict(base)
+    for key, value in over.items():
+        old = merged.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            kind = value.get("kind", old.get("kind"))
+            replaced = key == "excitation" and kind != old.get("kind", "standing_wave")
+            merged[key] = dict(value) if replaced else _merge(old, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _scene(flags: SceneFlags, tables: tuple[str, ...] = ()) -> tuple[Scene, dict[str, Any]]:
+    """The scene of config file and flags, and the config's further tables."""
+    config = read_toml(flags.config) if flags.config is not None else {}
+    extra = {name: config.pop(name) for name in tables if name in config}
+    given = flags.overrides()
+    if isinstance(given.get("times"), Mapping) and not isinstance(config.get("times"), Mapping):
+        config["times"] = {"start": 0.0, "stop": 50.0, "step": 0.25}
+    return Scene.from_dict(_merge(config, given)), extra
+
+
+def _device(name: str) -> str:
+    try:
+        torch.empty(0, device=torch.device(name))
+    except (RuntimeError, AssertionError) as error:
+        raise checks.fail("device", "be available here", f"{name!r}: {str(error).splitlines()[0][:100]}") from None
+    return name
+
+
+def _figure(width: float, height: float, rows: int, columns: int) -> Any:
+    import matplotlib.figure
+
+    figure = matplotlib.figure.Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _png(figure: Any) -> outputs.Writer:
+    return lambda path: figure.savefig(path, dpi=150)
+
+
+def run_simulate(flags: Simulate, arguments: list[str]) -> None:
+    """Measure a scene's observables and leave config, data, figure and record in the output folder."""
+    began = time.time()
+    scene, _ = _scene(flags)
+    out, device = outputs.check_writable(flags.out), _device(flags.device)
+    checks.choice("method", flags.method, ("auto", *METHODS))
+    stages = Stages()
+    data = simulate(scene, flags.method, device=device, progress=True, stages=stages)
+    figure = _simulate_figure(scene, data)
+    config = scene.to_toml()
+    outputs.write(
+        out,
+        {
+            "config.toml": outputs.text(config),
+            "results.nc": outputs.dataset(data),
+            "figure.png": _png(figure),
+            "run.json": outputs.run_record(
+                arguments, config, device, began, stages.seconds, seed=scene.seed, method=flags.method,
+                realized={name: data.attrs[name] for name in ("mass_mean", "mass_sd")},
+            ),
+        },
+    )  # fmt: skip
+    print(describe(scene))
+    print(f"masses: mean {data.attrs['mass_mean']:.6f}, standard deviation {data.attrs['mass_sd']:.6f}")
+    for name in scene.observables:
+        last = data[name].isel(time=-1) if "time" in data[name].dims else data[name]
+        error = data[f"{name}_stderr"]
+        error = error.isel(time=-1) if "time" in error.dims else error
+        if last.ndim == 0:
+            print(f"{name} at the last time: {float(last):.6g} +- {float(error):.2g}")
+    print(f"{time.time() - began:.1f} s, results in {out}")
+
+
+def _simulate_figure(scene: Scene, data: xarray.Dataset) -> Any:
+    names = list(scene.observables)
+    figure, axes = _figure(6, 3.6 * len(names), len(names), 1)
+    times = scene.times.numpy()
+    for ax, name in zip(axes[:, 0], names, strict=True):
+        values = data[name]
+        first = values.isel(tone=len(scene.tones) // 2) if "tone" in values.dims else values
+        label = f"{values.attrs['long_name']} ({values.attrs['units']})"
+        chosen = f"tone {int(first.tone)}" if "tone" in values.dims else ""
+        if name == "band_energy":
+            plots.band_map(ax, times, first.values, title=chosen)
+        elif first.ndim == 2:
+            axis = first.dims[1]
+            plots.field_map(
+                ax, times, data[axis].values, first.values, plots.TIME_LABEL, data[axis].attrs.get("long_name", str(axis)),
+                label, chosen, signed=name == "displacement",
+            )  # fmt: skip
+        else:
+            axis = first.dims[0]
+            error = data[f"{name}_stderr"]
+            error = error.isel(tone=len(scene.tones) // 2) if "tone" in error.dims else error
+            plots.curve(ax, data[axis].values, first.values, error.values)
+            ax.set(xlabel=data[axis].attrs.get("long_name", str(axis)), ylabel=label, title=chosen)
+    figure.suptitle(describe(scene), fontsize="small")
+    return figure
+
+
+def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
+    """Ensemble, master equation, prediction and their distance; leaves data, model, figure and record."""
+    began = time.time()
+    scene, extra = _scene(flags, ("calibration",))
+    settings = _merge(extra.get("calibration", {}), flags.calibration())
+    checks.known_keys("calibration", settings, ("method", "model", "window", "constraint", "penalty", "steps", "learning_rate", "tolerance"))  # fmt: skip
+    settings["method"] = settings.get("method", "adam")
+    if "window" in settings:
+        settings["window"] = tuple(settings["window"])
+    out, device = outputs.check_writable(flags.out), _device(flags.device)
+    checks.choice("method", flags.method, ("auto", *METHODS))
+    stages = Stages()
+    transfer = band_transfer(scene, flags.method, device=device, progress=True, stages=stages)
+    with stages("calibration"), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        master = calibrate(transfer, progress=True, **settings)
+    with stages("prediction"):
+        predicted = master.solve(torch.eye(master.n_bands, dtype=torch.float64), transfer.times).detach()
+    with stages("comparison"):
+        rows = comparison(transfer, master, predicted)
+    with stages("figure"):
+        figure = calibration_figure(transfer, master, predicted)
+    data = transfer.to_dataset()
+    data["prediction"] = data["band_energy"].copy(data=predicted.numpy())
+    data["prediction"].attrs["long_name"] = "share of the energy predicted by the master equation"
+    chosen = {**settings, "model": master.calibration.model, "window": list(master.calibration.window or ())}
+    config = transfer.scene.to_toml() + "\n" + tomli_w.dumps({"calibration": chosen})
+    with stages("writing"):
+        outputs.write(
+            out,
+            {
+                "config.toml": outputs.text(config),
+                "transfer.nc": outputs.dataset(data),
+                "model.safetensors": master.save,
+                "figure.png": _png(figure),
+                "run.json": outputs.run_record(
+                    arguments, config, device, began, stages.seconds, seed=scene.seed, method=flags.method,
+                    realized=transfer.attributes, summary=dict(rows),
+                ),
+            },
+        )  # fmt: skip
+    print(describe(transfer.scene))
+    for warning in caught:
+        print(f"warning: {warning.message}")
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        print(f"{name:<{width}}  {value:.4g}" if isinstance(value, float) else f"{name:<{width}}  {value}")
+    print("seconds: " + ", ".join(f"{name} {seconds:.2f}" for name, seconds in stages.seconds.items()))
+    print(f"{time.time() - began:.1f} s, results in {out}")
+
+
+def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.Tensor) -> list[tuple[str, Any]]:
+    """The table of a calibration: what the model is, how far it is from its ensemble, and the ensemble's own error."""
+    distance = total_variation(predicted, transfer.mean)
+    statistical = statistical_distance(transfer.stderr)
+    end = float(transfer.times[-1])
+    late = transfer.times > end / 2
+    early = ~late & (transfer.times > 0)
+    rows: list[tuple[str, Any]] = [
+        (
+            "model",
+            f"{master.calibration.model}, fitted by {master.calibration.method}, {master.model.n_parameters} parameters",
+        ),
+        ("conservation defect of Q", master.conservation_defect),
+        ("most negative rate", master.most_negative_rate),
+        ("lowest predicted share of energy", float(predicted.min())),
+    ]
+    if bool(early.any()):
+        rows.append((f"total variation to the ensemble, 0 < t <= {end / 2:g}", float(distance[:, early].mean())))
+    rows.append((f"total variation to the ensemble, {end / 2:g} < t <= {end:g}", float(distance[:, late].mean())))
+    rows.append(
+        ("statistical error: total variation of two such ensembles", float(statistical[:, transfer.times > 0].mean()))
+    )
+    rows.append(
+        ("masses: realized mean, standard deviation", "{mass_mean:.5f}, {mass_sd:.5f}".format(**transfer.attributes))
+    )
+    return rows
+
+
+def calibration_figure(transfer: BandTransfer, master: MasterEquation, predicted: torch.Tensor) -> Any:
+    """Measured and predicted maps of two sources, decay curves, rates, and the distance over time."""
+    n = transfer.n_bands
+    low, high = max(1, round(n * 10 / 32)), max(1, round(n * 23 / 32))
+    times, mean, stderr = transfer.times.numpy(), transfer.mean.numpy(), transfer.stderr.numpy()
+    model = predicted.numpy()
+    figure, axes = _figure(13.5, 10, 3, 3)
+    for row, source in enumerate((low, high)):
+        plots.band_map(axes[row, 0], times, mean[source - 1], f"ensemble, source band {source}")
+        plots.band_map(axes[row, 1], times, model[source - 1], f"master equation, source band {source}")
+        other = max(1, source - 3)
+        plots.decay_comparison(
+            axes[row, 2],
+            times,
+            mean,
+            stderr,
+            model,
+            list(dict.fromkeys([(source, source), (source, other)])),
+            f"source band {source}",
+        )
+    plots.rate_map(axes[2, 0], master.rates.detach().numpy(), "rates Q (diagonal: loss)")
+    plots.distance_curve(
+        axes[2, 1],
+        times,
+        total_variation(predicted, transfer.mean).numpy(),
+        statistical_distance(transfer.stderr).numpy(),
+        "distance of model and ensemble",
+    )
+    ax = axes[2, 2]
+    bands = np.arange(1, n + 1)
+    ax.plot(bands, -master.rates.detach().diagonal().numpy(), "o", label="loss rate $-Q_{ss}$")
+    off = master.rates.detach() - torch.diag(master.rates.detach().diagonal())
+    ax.plot(bands, off.sum(-1).numpy(), "-", label=r"$\sum_{r \neq s} Q_{sr}$")
+    ax.set(xlabel="source s", ylabel="rate", title="conservation")
+    ax.legend(fontsize="small")
+    figure.suptitle(f"{describe(transfer.scene)}; model {master.calibration.model}, {master.calibration.method}")
+    return figure
+
+
+PREDICT_KEYS = ("source", "initial", "times")
+
+
+def run_predict(flags: Predict, arguments: list[str]) -> None:
+    """Solve a saved master equation and leave the request, the data, the figure and the record."""
+    began = time.time()
+    config = read_toml(flags.config) if flags.config is not None else {}
+    given = _merge(config, flags.overrides())
+    checks.known_keys("predict", given, PREDICT_KEYS)
+    checks.choice("method", flags.method, SOLVERS)
+    out, device = outputs.check_writable(flags.out), _device(flags.device)
+    stages = Stages()
+    with stages("loading"):
+        master = MasterEquation.load(flags.model).to(device)
+    n = master.n_bands
+    times = given.get("times", {})
+    if isinstance(times, Mapping):
+        checks.known_keys("times", times, ("start", "stop", "step"))
+        wanted = regular_times(times.get("start", 0.0), times.get("stop", 50.0), times.get("step", 0.25))
+    else:
+        wanted = checks.times("times", times)
+    if "initial" in given:
+        if "source" in given:
+            raise checks.fail("source", "not be given together with initial", given["source"])
+        initial = checks.real_tensor("initial", given["initial"])
+        if tuple(initial.shape) != (n,):
+            raise checks.fail("initial", f"hold the {n} bands of the model", f"{initial.numel()} numbers")
+        starts, labels = initial[None], ["initial"]
+        request: dict[str, Any] = {"initial": initial.tolist()}
+    else:
+        source = given.get("source", range(1, n + 1))
+        if isinstance(source, (str, Mapping, int)) or not len(source):
+            raise checks.FieldTypeError(f"source must be a list of bands, got {checks.shown(source)}")
+        bands = [checks.integer("source", s, 1, n) for s in source]
+        starts, labels = torch.eye(n, dtype=torch.float64)[[s - 1 for s in bands]], [str(s) for s in bands]
+        request = {"source": bands}
+    with stages("prediction"):
+        energy = master.solve(starts, wanted, method=flags.method).detach().cpu()
+    data = xarray.Dataset(
+        {
+            "band_energy": (
+                ("start", "time", "band"),
+                energy.numpy(),
+                {"units": "energy of the start", "long_name": "energy in a band"},
+            )
+        },
+        coords={
+            "start": ("start", labels, {"long_name": "source band of the start"}),
+            "time": (
+                "time",
+                wanted.numpy(),
+                {"units": "travel time of sound over one particle", "long_name": "time t"},
+            ),
+            "band": ("band", np.arange(1, n + 1), {"long_name": plots.BAND_LABEL}),
+        },
+        attrs={"model": str(Path(flags.model).name), "calibrated_on": master.calibration.scene.to_toml()},
+    )
+    shown = [0] if len(labels) == 1 else [round((len(labels) - 1) * f) for f in (10 / 32, 23 / 32)]
+    figure, axes = _figure(5.5 * len(shown), 4, 1, len(shown))
+    for ax, index in zip(axes[0], shown, strict=True):
+        total = float(starts[index].sum()) or 1.0
+        plots.band_map(ax, wanted.numpy(), energy[index].numpy() / total, f"start: {labels[index]}")
+    text = tomli_w.dumps({**request, "times": wanted.tolist()})
+    outputs.write(
+        out,
+        {
+            "config.toml": outputs.text(text),
+            "results.nc": outputs.dataset(data),
+            "figure.png": _png(figure),
+            "run.json": outputs.run_record(
+                arguments, text, device, began, stages.seconds, seed=flags.seed, method=flags.method
+            ),
+        },
+    )
+    print(f"{len(labels)} starts, {len(wanted)} times to {float(wanted[-1]):g}, solved by {flags.method}")
+    print(f"largest change of total energy: {float((energy.sum(-1) - starts.sum(-1)[:, None]).abs().max()):.3g}")
+    print(f"lowest energy in a band: {float(energy.min()):.3g}")
+    print("seconds: " + ", ".join(f"{name} {seconds:.4f}" for name, seconds in stages.seconds.items()))
+    print(f"results in {out}")

@@ -1,0 +1,325 @@
+"""General-purpose integrators of torchdiffeq and scipy, as peers to compare the chain's own methods with.
+
+All integrate the first-order form d/dt (u, v, E) = (v, M^-1 (F - D v), power lost), with the energy lost to damping E
+in the place of one more particle, in units of the start's amplitude so that one tolerance fits all. Linear and Hertz
+contacts, damping and gradients come with that; symplecticity does not, and the energy is watched instead.
+
+torchdiffeq's ``euler`` is left out: it multiplies the amplitude of a mode by 1 + (w step)^2 / 2 at every step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import Chain
+from torchchain.evolvers import drift
+from torchchain.evolvers.method import Advance, Method, Trajectory
+from torchchain.evolvers.symplectic import (
+    check_limits,
+    damping_rate,
+    highest_frequency,
+    initial_overlap,
+    largest_overlap,
+    substeps,
+)
+from torchchain.excitation import State
+
+ALLOWED_DRIFT = 0.1
+
+
+class IntegrationError(RuntimeError):
+    """An adaptive solver gave up."""
+
+
+class _Motion:
+    """The right-hand side, which also sees every step and notes when each Hertz contact first opens."""
+
+    def __init__(self, chain: Chain, state: State) -> None:
+        self.chain = chain
+        self.n = chain.n_particles
+        self.weight = 1 / chain.align(chain.masses, state.displacement)
+        self.hertz, self.damped = chain.contact == "hertz", chain.is_damped
+        self.damping = chain.align(chain.contact_damping, chain.elongation(state.displacement))
+        amplitude = torch.stack([state.displacement, state.velocity]).detach().abs().amax().item()
+        self.amplitude = amplitude if amplitude > 0 else 1.0
+        self.opened_at = torch.full_like(chain.elongation(state.displacement.detach()), math.inf)
+        self.since = 0.0
+
+    def __call__(self, t: Tensor, y: Tensor) -> Tensor:
+        displacement, velocity = y[..., : self.n], y[..., self.n : 2 * self.n]
+        tension = self.chain.tension(self.chain.elongation(displacement))
+        rates = [velocity]
+        if self.damped:
+            rate = self.chain.elongation(velocity)
+            damping = self.damping * ~self.chain.open_contacts(displacement) if self.hertz else self.damping
+            tension = tension + damping * rate
+            power = (damping * rate.square()).sum(-1, keepdim=True) / self.amplitude
+        rates.append(self.weight * self.chain.net(tension))
+        return torch.cat([*rates, power] if self.damped else rates, dim=-1)
+
+    def note(self, t: float, y: Tensor) -> None:
+        """Remember the contacts that are open at a time."""
+        if self.hertz:
+            opened = self.chain.open_contacts(y[..., : self.n].detach())
+            self.opened_at = torch.where(opened, self.opened_at.clamp(max=t), self.opened_at)
+
+    def note_step(self, t: Tensor, y: Tensor, dt: Tensor) -> None:
+        """What torchdiffeq calls at the start of a step, its t counted from the start of the window."""
+        self.note(self.since + float(t), y)
+
+
+@dataclass(frozen=True)
+class _Solver:
+    """What one of torchdiffeq's solvers needs to be told, and what is known of it."""
+
+    name: str
+    order: int
+    evaluations: str
+    summary: str
+    stability: str
+    torchdiffeq: str
+    options: dict[str, Any] = field(default_factory=dict)
+    limit: float | None = None
+    damping_limit: float | None = None
+
+
+def _member_norm(y: Tensor) -> Tensor:
+    """The largest root-mean-square over the members of a batch, where torchdiffeq would average over all of them."""
+    return y.square().mean(-1).sqrt().amax()
+
+
+def _evolve(
+    chain: Chain,
+    state: State,
+    integrate: Callable[[_Motion, Tensor, float, list[float]], list[Tensor]],
+    remedy: str,
+) -> Advance:
+    """The evolution by ``integrate(motion, y, now, times)``, which returns y at each of the times after ``now``."""
+    dtype = torch.promote_types(chain.masses.dtype, state.displacement.dtype)
+    chain = replace(chain, masses=chain.masses.to(dtype))
+    state = State(state.displacement.to(dtype), state.velocity.to(dtype))
+    motion = _Motion(chain, state)
+    n = chain.n_particles
+    initial = drift.total(chain, state.displacement, state.velocity).detach()
+    y = torch.cat([state.displacement, state.velocity], dim=-1)
+    if motion.damped:
+        y = torch.cat([y, torch.zeros_like(y[..., :1])], dim=-1)
+    now = 0.0
+
+    def advance(times: Tensor) -> Trajectory:
+        nonlocal y, now
+        targets: list[float] = times.tolist()
+        if targets[0] < now:
+            raise checks.fail("times", f"continue from {now:g}, the end of the last window", targets[0])
+        ahead = [target for target in targets if target > now]
+        motion.note(now, y)
+        series = [y] * (len(targets) - len(ahead)) + (integrate(motion, y, now, ahead) if ahead else [])
+        for target, values in zip(targets, series, strict=True):
+            motion.note(target, values)
+        y, now = series[-1], targets[-1]
+        stacked = torch.stack(series, dim=-2)
+        openings = None
+        if motion.hertz:
+            openings = torch.stack([(motion.opened_at <= target).sum(-1) for target in targets], dim=-1)
+        trajectory = Trajectory(
+            times,
+            stacked[..., :n],
+            stacked[..., n : 2 * n],
+            stacked[..., -1] * motion.amplitude if motion.damped else None,
+            openings,
+        )
+        drift.check(chain, trajectory, initial, ALLOWED_DRIFT, remedy)
+        return trajectory
+
+    return advance
+
+
+def _start_adaptive(
+    solver: _Solver, chain: Chain, state: State, rtol: float | None = None, atol: float | None = None
+) -> Advance:
+    """See the registry entries below."""
+    from torchdiffeq import odeint
+
+    eps = torch.finfo(chain.masses.dtype).eps
+    rtol = eps**0.5 if rtol is None else checks.number("rtol", rtol, above=0, below=1)
+    atol = None if atol is None else checks.number("atol", atol, above=0)
+    if solver.torchdiffeq == "scipy_solver":
+        for name in ("masses", "stiffness", "damping"):
+            _refuse_gradient(name, torch.as_tensor(getattr(chain, name)), solver.name)
+        for name in ("displacement", "velocity"):
+            _refuse_gradient(name, getattr(state, name), solver.name)
+
+    def integrate(motion: _Motion, y: Tensor, now: float, times: list[float]) -> list[Tensor]:
+        grid = torch.tensor([0.0, *(time - now for time in times)], dtype=torch.float64, device=y.device)
+        options = dict(solver.options)
+        if solver.torchdiffeq != "scipy_solver":
+            options |= {"norm": _member_norm, "step_t": grid[1:]}
+            motion.since, motion.callback_accept_step = now, motion.note_step  # type: ignore[attr-defined]
+        try:
+            series = odeint(
+                motion,
+                y,
+                grid,
+                rtol=rtol,
+                atol=rtol * motion.amplitude if atol is None else atol,
+                method=solver.torchdiffeq,
+                options=options,
+            )
+        except AssertionError as error:
+            raise IntegrationError(f"method '{solver.name}' gave up with rtol {rtol:.1e}: {str(error)[:80]}") from error
+        if len(series) < len(grid):
+            raise IntegrationError(f"method '{solver.name}' gave up with rtol {rtol:.1e} before time {times[-1]:g}")
+        return list(series[1:])
+
+    return _evolve(chain, state, integrate, f"method '{solver.name}' with rtol {rtol:.1e}: use a smaller rtol")
+
+
+def _refuse_gradient(field: str, value: Tensor, method: str) -> None:
+    if value.requires_grad:
+        raise checks.fail(field, f"not require a gradient for method '{method}'", "requires_grad=True")
+
+
+def _start_fixed(solver: _Solver, chain: Chain, state: State, step: float | None = None) -> Advance:
+    """See the registry entries below."""
+    from torchdiffeq import odeint
+
+    if step is None:
+        step = 0.1 / highest_frequency(chain, largest_overlap(chain, state)).amax().item()
+        if chain.is_damped:
+            step = min(step, 0.1 / damping_rate(chain).amax().item())
+    step = checks.number("step", step, above=0)
+    rates = [("w_max", solver.limit, highest_frequency(chain, initial_overlap(chain, state)))]
+    if chain.is_damped:
+        rates.append(("d_max", solver.damping_limit, damping_rate(chain)))
+    check_limits(step, solver.name, rates)
+
+    def integrate(motion: _Motion, y: Tensor, now: float, times: list[float]) -> list[Tensor]:
+        series: list[Tensor] = []
+        motion.callback_step = motion.note_step  # type: ignore[attr-defined]
+        counts = substeps(now, times, step)
+        starts = [now, *times[:-1]]
+        lengths = [(end - begin) / count for begin, end, count in zip(starts, times, counts, strict=True)]
+        first = 0
+        while first < len(times):
+            # Multistep methods assume equal steps, so that a change of their length is a fresh start.
+            last = first + 1
+            while last < len(times) and abs(lengths[last] - lengths[first]) < 1e-9 * lengths[first]:
+                last += 1
+            motion.since = starts[first]
+            outputs = [0.0, *(time - starts[first] for time in times[first:last])]
+            pieces = [
+                torch.linspace(begin, end, count + 1, dtype=torch.float64)[:-1]
+                for begin, end, count in zip(outputs[:-1], outputs[1:], counts[first:last], strict=True)
+            ]
+            t = torch.tensor(outputs, dtype=torch.float64)
+            grid = torch.cat([*pieces, t[-1:]])
+            found = odeint(
+                motion,
+                y,
+                t.to(y.device),
+                # An explicit predictor corrected once, not iterated: any tolerance will do.
+                rtol=1e3,
+                atol=1e3,
+                method=solver.torchdiffeq,
+                options={**solver.options, "grid_constructor": partial(_fixed_grid, grid.to(y.device))},
+            )
+            series += found[1:]
+            y, first = series[-1], last
+        return series
+
+    return _evolve(chain, state, integrate, f"method '{solver.name}' with step {step:.4g}: use a smaller step")
+
+
+def _fixed_grid(grid: Tensor, *_: Any) -> Tensor:
+    return grid
+
+
+NO_STEP = (
+    "no step is stable on an undamped chain: the amplitude of a mode grows by a factor of 1 + {growth} at every step"
+)
+
+ADAPTIVE = (
+    _Solver("dopri5", 5, "6", "Dormand and Prince 5(4)", "by its error estimate", "dopri5"),
+    _Solver("dopri8", 8, "13", "Dormand and Prince 8(7)", "by its error estimate", "dopri8"),
+    _Solver("bosh3", 3, "3", "Bogacki and Shampine 3(2)", "by its error estimate", "bosh3"),
+    _Solver("adaptive_heun", 2, "2", "Heun 2(1)", "by its error estimate", "adaptive_heun"),
+    _Solver("fehlberg2", 2, "3", "Fehlberg 2(1)", "by its error estimate", "fehlberg2"),
+    _Solver("lsoda", 0, "about 2", "LSODA, Adams of variable order", "by its error estimate", "scipy_solver"),
+)
+
+FIXED = (
+    _Solver("midpoint", 2, "2", "explicit midpoint rule", NO_STEP.format(growth="(w step)^4 / 8"), "midpoint"),
+    _Solver("heun2", 2, "2", "Heun's second-order rule", NO_STEP.format(growth="(w step)^4 / 8"), "heun2"),
+    _Solver(
+        "heun3", 3, "3", "Heun's third-order rule", "w_max step < 1.732", "heun3", limit=3**0.5, damping_limit=2.51
+    ),
+    _Solver("rk4", 4, "4", "Runge-Kutta, 3/8 rule", "w_max step < 2.828", "rk4", limit=8**0.5, damping_limit=2.78),
+    _Solver(
+        "explicit_adams",
+        4,
+        "1",
+        "Adams and Bashforth with four past steps",
+        "w_max step < 0.43",
+        "explicit_adams",
+        {"max_order": 5},
+        limit=0.43,
+        damping_limit=0.3,
+    ),
+    _Solver(
+        "implicit_adams",
+        5,
+        "2",
+        "Adams, Bashforth and Moulton with four past steps, corrected once",
+        NO_STEP.format(growth="0.1 (w step)^6"),
+        "implicit_adams",
+        {"max_order": 5},
+        limit=1.0,
+        damping_limit=1.41,
+    ),
+)
+
+
+def _entry(solver: _Solver, start: Callable[..., Advance], options: dict[str, str]) -> Method:
+    adaptive, gradient = solver in ADAPTIVE, solver.torchdiffeq != "scipy_solver"
+    loss = "cannot keep energy, which drifts (an error beyond a tenth)"
+    return Method(
+        name=solver.name,
+        start=partial(start, solver),
+        summary=f"{solver.summary}, {'adaptive, ' if adaptive else ''}from {'torchdiffeq' if gradient else 'scipy'}",
+        order=f"{solver.order}" if solver.order else "variable, up to 12",
+        conserves="momentum",
+        stability=solver.stability + ("" if adaptive else "; the energy is watched"),
+        cost=f"{solver.evaluations} forces per step, N each",
+        cannot=loss if gradient else f"{loss}; gradients; the CPU only, one step for the whole batch",
+        contacts=("linear", "hertz"),
+        damped=True,
+        options=options,
+    )
+
+
+METHODS = tuple(
+    _entry(
+        solver,
+        _start_adaptive,
+        {
+            "rtol": "relative error per step (default the square root of eps)",
+            "atol": "absolute error per step (default rtol times the start's largest displacement or velocity)",
+        },
+    )
+    for solver in ADAPTIVE
+) + tuple(
+    _entry(
+        solver,
+        _start_fixed,
+        {"step": "largest step; outputs are reached by equal steps of at most that (default 0.1 / w_max)"},
+    )
+    for solver in FIXED
+)

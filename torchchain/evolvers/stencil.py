@@ -1,0 +1,693 @@
+"""Chebyshev propagation with one chain kept in cache: the Numba kernels behind :mod:`chebyshev` and :mod:`fused`.
+
+A state at time t is a sum of Chebyshev polynomials T_k(x) of x = 1 - 2 A / W^2, A = -M^-1 K, applied to the state
+(u, v) at an earlier *anchor*:
+
+    u(t) = sum_k [c_k T_k u + s_k T_k v],    v(t) = sum_k [c_k T_k v + d_k T_k u],
+
+with z = W (t - anchor) and
+
+    c_k = 2 J_2k(z),    s_k = (4 / W) (J_2k+1 + J_2k+3 + ...)(z),    d_k = W (J_2k-1 - J_2k+1)(z),
+
+c_0 and s_0 being half of that and d_0 = -W J_1. The outputs that follow an anchor closely form one *segment* and
+share its T_k; the last of them is the next anchor.
+
+On a uniform time grid the states mirrored about an anchor are at hand too, and then one recursion does for both:
+
+    u(+t) = 2 sum_k c_k T_k u - u(-t),    v(+t) = v(-t) + 2 sum_k d_k T_k u.
+
+Each row (one realization and one start) is treated by itself, in an order that depends on nothing but its own chain,
+start and times: a row gives the same bits alone and in any batch, whatever the number of threads.
+
+Importing this file imports Numba; :mod:`chebyshev` does it at the first use.
+"""
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import njit
+
+# What a march leaves behind at every output time; the fields are those whose transforms make the energy of a
+# wavenumber. Kinds 3 and up write as many fields as they name.
+STATES, SITE_MOMENTS, BOND_MOMENTS, UNIFORM_FIELDS, SITE_FIELDS, BOND_FIELDS = range(6)
+
+# A segment ends before z exceeds REACH or the outputs exceed LONGEST: the work per output, degree(z) stencils shared
+# by the segment plus two sums per output, is flat around this minimum (a sum costs a sixth of a stencil).
+REACH = 8.0
+LONGEST = 6
+# The mirrored form adds up rounding errors like a random walk's integral; a plain step now and then ends that.
+RESTART = 64
+# Dropped at the edges of the active window: energy norm below half an ulp of the whole chain's.
+TRIM = 2.0**-53
+
+_SLACK = 8.9e-16  # times closer than this, relative to themselves, count as equal on a uniform grid
+_PAD = 8  # cells on either side of a row: at least one, kept at 64 bytes for alignment
+_RING = 6  # rows of T_k alive at a time: four that are summed together and the two before them
+
+_kernel = njit(nogil=True, cache=True, fastmath={"contract"})
+_summing_kernel = njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+
+
+# Rows of the scratch are reached as offsets into one flat array, and indices are unsigned: signed ones make Numba
+# test for a negative index at every load, which keeps the loops from being vectorized.
+_U = np.uint64
+
+
+@_kernel
+def _first(w, middle, new, left, right, n):
+    """T_1 = x T_0 on n particles."""
+    b, c, f, g, one = _U(middle), _U(new), _U(left), _U(right), _U(1)
+    for i in range(_U(n)):
+        x = w[b + i]
+        w[c + i] = 0.5 * (w[f + i] * (w[b + i - one] - x) + w[g + i] * (w[b + i + one] - x)) + x
+
+
+@_kernel
+def _next(w, old, middle, new, left, right, n):
+    """T_k+1 = 2 x T_k - T_k-1 on n particles; differences first, so that a translation stays one exactly."""
+    a, b, c, f, g, one = _U(old), _U(middle), _U(new), _U(left), _U(right), _U(1)
+    for i in range(_U(n)):
+        x = w[b + i]
+        w[c + i] = (w[f + i] * (w[b + i - one] - x) + w[g + i] * (w[b + i + one] - x)) + (2.0 * x - w[a + i])
+
+
+@_kernel
+def _next_even(w, old, middle, new, left, n):
+    """:func:`_next` where both contacts of every particle are equally stiff."""
+    a, b, c, f, one = _U(old), _U(middle), _U(new), _U(left), _U(1)
+    for i in range(_U(n)):
+        x = w[b + i]
+        w[c + i] = w[f + i] * ((w[b + i - one] - x) + (w[b + i + one] - x)) + (2.0 * x - w[a + i])
+
+
+@_kernel
+def _add_four(w, u, v, row0, row1, row2, row3, for_u, for_v, k, n):
+    """Four terms of the sums for the displacement and velocity of one output."""
+    c0, c1, c2, c3 = for_u[k], for_u[k + 1], for_u[k + 2], for_u[k + 3]
+    d0, d1, d2, d3 = for_v[k], for_v[k + 1], for_v[k + 2], for_v[k + 3]
+    p, q, a, b, c, d = _U(u), _U(v), _U(row0), _U(row1), _U(row2), _U(row3)
+    for i in range(_U(n)):
+        t0, t1, t2, t3 = w[a + i], w[b + i], w[c + i], w[d + i]
+        w[p + i] = w[p + i] + c0 * t0 + c1 * t1 + c2 * t2 + c3 * t3
+        w[q + i] = w[q + i] + d0 * t0 + d1 * t1 + d2 * t2 + d3 * t3
+
+
+@_kernel
+def _first_four(w, u, v, row0, row1, row2, row3, for_u, for_v, keep_u, keep_v, n):
+    """Terms 0 to 3; what the output's rows held is kept with the factors 0, 1 or -1."""
+    c0, c1, c2, c3 = for_u[0], for_u[1], for_u[2], for_u[3]
+    d0, d1, d2, d3 = for_v[0], for_v[1], for_v[2], for_v[3]
+    p, q, a, b, c, d = _U(u), _U(v), _U(row0), _U(row1), _U(row2), _U(row3)
+    for i in range(_U(n)):
+        t0, t1, t2, t3 = w[a + i], w[b + i], w[c + i], w[d + i]
+        w[p + i] = keep_u * w[p + i] + c0 * t0 + c1 * t1 + c2 * t2 + c3 * t3
+        w[q + i] = keep_v * w[q + i] + d0 * t0 + d1 * t1 + d2 * t2 + d3 * t3
+
+
+@_summing_kernel
+def _moments_site(w, u, v, mass, contact, reference, first, n):
+    """Sums of E, q E and q^2 E over n particles, E of Eq. 36 and q the particle number minus the reference."""
+    p, s, b, k, one = _U(u), _U(v), _U(mass), _U(contact), _U(1)
+    total, center, width = 0.0, 0.0, 0.0
+    q = first - reference
+    for i in range(_U(n)):
+        x, y = w[p + i], w[s + i]
+        energy = w[b + i] * y * y + x * (w[k + i] * (x - w[p + i - one]) + w[k + i + one] * (x - w[p + i + one]))
+        number = q + np.float64(np.int64(i))
+        total += energy
+        center += number * energy
+        width += number * number * energy
+    return 0.5 * total, 0.5 * center, 0.5 * width
+
+
+@_summing_kernel
+def _moments_bond(w, u, v, mass, contact, reference, first, n):
+    """The same with E of Eq. A3; the other half of a wall contact is added by the caller."""
+    p, s, b, k, one = _U(u), _U(v), _U(mass), _U(contact), _U(1)
+    total, center, width = 0.0, 0.0, 0.0
+    q = first - reference
+    for i in range(_U(n)):
+        x, y = w[p + i], w[s + i]
+        left, right = x - w[p + i - one], w[p + i + one] - x
+        energy = w[b + i] * y * y + 0.5 * (w[k + i] * left * left + w[k + i + one] * right * right)
+        number = q + np.float64(np.int64(i))
+        total += energy
+        center += number * energy
+        width += number * number * energy
+    return 0.5 * total, 0.5 * center, 0.5 * width
+
+
+@_kernel
+def _bessel(z, values):
+    """J_0(z) to J_top(z) by downward recurrence (Miller), normalized by J_0 + 2 J_2 + 2 J_4 + ... = 1.
+
+    The recurrence starts where J is below 1e-25 (see :func:`_top_order`), so its start does not show.
+    """
+    top = values.size - 1
+    if z < 1e-6:  # the next terms of the series are below 1e-24
+        values[:] = 0.0
+        values[0], values[1], values[2] = 1.0 - z * z / 4, z / 2, z * z / 8
+        return
+    ratio = 2.0 / z
+    above, here, norm = 0.0, 1e-280, 0.0
+    for order in range(top, 0, -1):
+        values[order] = here
+        if order % 2 == 0:
+            norm += here
+        above, here = here, order * ratio * here - above
+        if abs(here) > 1e250:
+            values[order:] *= 1e-250
+            above, here, norm = above * 1e-250, here * 1e-250, norm * 1e-250
+    values[0] = here
+    values *= 1.0 / (here + 2.0 * norm)
+
+
+@_kernel
+def _top_order(z):
+    """An even order at which J(z) is below 1e-25: by Kapteyn's bound at this distance above z, for any z."""
+    return 2 * int(0.5 * z + 8.0 * z ** (1.0 / 3.0) + 10.0)
+
+
+@_kernel
+def _coefficients(frequency, time, tolerance, bessel, cosine, drift, slope):
+    """c_k, s_k and d_k of this file's heading for one time after the anchor; returns the number of terms.
+
+    Terms are dropped while the sums of |c_k|, W |s_k| and |d_k| / W over all that are dropped stay within the
+    tolerance: summed over the Bessel functions themselves, which above the order z are positive and fall faster
+    than geometrically. As |T_k| <= 1 on the spectrum, these sums bound the error in the mass norm of W u and of v.
+    The number is rounded up to a multiple of four. The first coefficient of each kind is then set so that a
+    translation of the whole chain, on which every T_k is 1, moves exactly: c = 1, s = time, d = 0.
+    """
+    z = frequency * time
+    values = bessel[: _top_order(z) + 1]
+    _bessel(z, values)
+    terms = 1
+    odd = 0.0  # J_2k+1 + J_2k+3 + ...
+    dropped_cosine, dropped_drift, dropped_slope = 0.0, 0.0, 0.0
+    for k in range(values.size // 2 - 1, 0, -1):
+        odd += values[2 * k + 1]
+        difference = values[2 * k - 1] - values[2 * k + 1]
+        if terms == 1:
+            dropped_cosine += 2 * abs(values[2 * k])
+            dropped_drift += 4 * abs(odd)
+            dropped_slope += abs(difference)
+            if max(dropped_cosine, dropped_drift, dropped_slope) > tolerance:
+                terms = k + 1
+        if k < cosine.size:
+            cosine[k] = 2 * values[2 * k]
+            drift[k] = 4 * odd / frequency
+            slope[k] = frequency * difference
+    terms = min(4 * ((terms + 3) // 4), cosine.size)
+    rest_cosine, rest_drift, rest_slope = 0.0, 0.0, 0.0
+    for k in range(terms - 1, 0, -1):
+        rest_cosine += cosine[k]
+        rest_drift += drift[k]
+        rest_slope += slope[k]
+    cosine[0], drift[0], slope[0] = 1.0 - rest_cosine, time - rest_drift, -rest_slope
+    return terms
+
+
+class Row(NamedTuple):
+    """Where one chain lies in the flat scratch, and what kind of chain it is."""
+
+    n: int
+    periodic: bool
+    even: bool  # both contacts of every particle are equally stiff
+    mass: int
+    contact: int  # stiffness of the left contact
+    left: int  # 4 (stiffness of the left contact) / (W^2 mass)
+    right: int
+    ring: np.ndarray  # rows for T_k, k modulo 6
+
+
+@_kernel
+def _close(w, row, at):
+    """Fills the cells beyond both ends of a periodic row."""
+    w[at - 1] = w[at + row.n - 1]
+    w[at + row.n] = w[at]
+
+
+@_kernel
+def _expand(w, row, source, low, high, count, u, v, terms, for_u, for_v, keep_u, keep_v):
+    """Adds sum_k for_u[j, k] T_k and sum_k for_v[j, k] T_k, T_k applied to the source, to the states u[j], v[j].
+
+    The source is zero outside [low, high), and T_k outside [low - k, high + k): nothing else is touched. What the
+    states held before is kept with the factors 0, 1 or -1.
+
+    Returns:
+        The window that the states now fill.
+    """
+    most = 0
+    for j in range(count):
+        most = max(most, terms[j])
+    start, stop = low, high
+    for k in range(0, most, 4):
+        before_start, before_stop = start, stop
+        start, stop, full = low - k - 3, high + k + 3, False
+        if not row.periodic:
+            start, stop = max(start, 0), min(stop, row.n)
+        elif start < 1 or stop > row.n - 1:  # the window has closed around the ring
+            start, stop, full = 0, row.n, True
+        size = stop - start
+        if k > 0:  # the two rows before these held less, and beyond it they are zero
+            for q in range(k - 2, k):
+                at = row.ring[q % _RING]
+                w[at + start - 1 : at + before_start] = 0.0
+                w[at + before_stop : at + stop + 1] = 0.0
+                if full:
+                    _close(w, row, at)
+        for q in range(max(k, 1), k + 4):
+            new = row.ring[q % _RING]
+            middle = source if q == 1 else row.ring[(q - 1) % _RING]
+            old = source if q == 2 else row.ring[(q - 2) % _RING]
+            if q == 1:
+                _first(w, middle + start, new + start, row.left + start, row.right + start, size)
+            elif row.even:
+                _next_even(w, old + start, middle + start, new + start, row.left + start, size)
+            else:
+                _next(w, old + start, middle + start, new + start, row.left + start, row.right + start, size)
+            if full:
+                _close(w, row, new)
+            else:
+                w[new + start - 1] = 0.0
+                w[new + stop] = 0.0
+        t0 = start + (source if k == 0 else row.ring[k % _RING])
+        t1 = start + row.ring[(k + 1) % _RING]
+        t2 = start + row.ring[(k + 2) % _RING]
+        t3 = start + row.ring[(k + 3) % _RING]
+        for j in range(count):
+            if k == 0:
+                _first_four(w, u[j] + start, v[j] + start, t0, t1, t2, t3, for_u[j], for_v[j], keep_u, keep_v, size)
+            elif k < terms[j]:
+                _add_four(w, u[j] + start, v[j] + start, t0, t1, t2, t3, for_u[j], for_v[j], k, size)
+    return start, stop
+
+
+@_kernel
+def _quiet(w, row, u, v, used, stiff, p, limit):
+    """Whether particle p has less of the squared energy norm than the limit in each of the states.
+
+    Its share is b v^2 plus u^2 times the stiffness of both contacts: what the chain would lose with it.
+    """
+    for j in range(used):
+        x, y = w[u[j] + p], w[v[j] + p]
+        if w[row.mass + p] * (y * y + stiff * (w[row.left + p] + w[row.right + p]) * x * x) > limit:
+            return False
+    return True
+
+
+@_kernel
+def _trim(w, row, u, v, used, stiff, limit, low, high):
+    """The window without the edges that are quiet in all the used states; there, all states are set to zero."""
+    start, stop = low, high
+    while start < stop and _quiet(w, row, u, v, used, stiff, start, limit):
+        start += 1
+    while start < stop and _quiet(w, row, u, v, used, stiff, stop - 1, limit):
+        stop -= 1
+    for j in range(u.size):
+        for at in (u[j], v[j]):
+            w[at + low : at + start] = 0.0
+            w[at + stop : at + high] = 0.0
+    return start, stop
+
+
+@_kernel
+def _silent(w, at, low, high):
+    """Whether a row is zero."""
+    return not np.any(w[at + low : at + high])
+
+
+@_kernel
+def _start_energy(w, row, u, v):
+    """Twice the energy of a state."""
+    if row.periodic:
+        _close(w, row, u)
+    energy = 0.0
+    for p in range(row.n):
+        stretch = w[u + p] - w[u + p - 1]
+        energy += w[row.mass + p] * w[v + p] ** 2 + w[row.contact + p] * stretch**2
+    if not row.periodic:
+        energy += w[row.contact + row.n] * w[u + row.n - 1] ** 2
+    return energy
+
+
+@_kernel
+def _wall_moments(w, row, u, reference):
+    """What :func:`_moments_bond` leaves out: a wall contact belongs as a whole to its one particle."""
+    first, last = w[u], w[u + row.n - 1]
+    e0 = 0.25 * w[row.contact] * first * first
+    e1 = 0.25 * w[row.contact + row.n] * last * last
+    q0, q1 = 1.0 - reference, row.n - reference
+    return e0 + e1, q0 * e0 + q1 * e1, q0 * q0 * e0 + q1 * q1 * e1
+
+
+@_kernel
+def _record_moments(w, row, u, v, kind, low, high, reference, out):
+    """Leaves total, center and width of one state's energy behind.
+
+    Returns:
+        The reference for the next state's moments, the particle at this center: the width must not come out as
+        a small difference of large numbers.
+    """
+    size = high - low
+    if kind == SITE_MOMENTS:
+        total, first, second = _moments_site(
+            w, u + low, v + low, row.mass + low, row.contact + low, reference, low + 1.0, size
+        )
+    else:
+        total, first, second = _moments_bond(
+            w, u + low, v + low, row.mass + low, row.contact + low, reference, low + 1.0, size
+        )
+        if not row.periodic:
+            more = _wall_moments(w, row, u, reference)
+            total, first, second = total + more[0], first + more[1], second + more[2]
+    out[0], out[1], out[2] = total, np.nan, np.nan
+    if not total > 0.0:
+        return reference
+    offset = first / total
+    out[1] = reference + offset
+    out[2] = second / total - offset * offset
+    return reference + np.floor(offset + 0.5)
+
+
+@_kernel
+def _record_fields(w, row, u, v, kind, out, r, i):
+    """Leaves one state, or the fields that make up its energy in wavenumber space, in out[:, r, i]."""
+    n = row.n
+    if kind == STATES:
+        out[0, r, i] = w[u : u + n]
+        out[1, r, i] = w[v : v + n]
+    elif kind == BOND_FIELDS:
+        for p in range(n):
+            out[0, r, i, p] = math.sqrt(w[row.mass + p]) * w[v + p]
+            out[1, r, i, p] = math.sqrt(w[row.contact + p]) * (w[u + p] - w[u + p - 1])
+    else:
+        out[0, r, i] = w[v : v + n]
+        out[1, r, i] = w[row.mass : row.mass + n] * w[v : v + n]
+        out[2, r, i] = w[u : u + n]
+        if kind == SITE_FIELDS:
+            for p in range(n):
+                x = w[u + p]
+                left, right = w[row.contact + p], w[row.contact + p + 1]
+                out[3, r, i, p] = left * (x - w[u + p - 1]) + right * (x - w[u + p + 1])
+
+
+@_kernel
+def march(
+    begin, end, masses, contacts, frequencies, starts, periodic, times, tolerance, mirrored, kind,
+    anchors, latest, clock, fields, moments,
+):  # fmt: skip
+    """Evolves rows begin to end - 1 through the times, each in cache from the first time to the last.
+
+    Args:
+        begin, end: rows; row r is start r % starts of realization r // starts.
+        masses: (realization, particle).
+        contacts: stiffness of contacts 0 to N, (realization, N + 1); on a ring the last is the first.
+        frequencies: W, no less than any frequency of the chain, (realization,).
+        starts: rows per realization.
+        periodic: whether the chains are rings.
+        times: (time,), increasing, not before the clock.
+        tolerance: largest sum of dropped coefficients in a segment.
+        mirrored: use the states mirrored about an anchor where the times form a uniform grid, and take times that
+            are equal within rounding as equal. Without it the states do not depend on how the times are cut into
+            calls, to the last bit.
+        kind: STATES to BOND_FIELDS.
+        anchors, latest: states (row, 2, particle) at the last anchor and at the last time, updated.
+        clock: (row, 4): time of the anchor, times since it, last time, and twice the energy at the start (negative
+            while unknown), updated.
+        fields: (field, row, time, particle), written if the kind is one of states or fields.
+        moments: (row, time, 3), total, center and width, written if the kind is one of moments.
+    """
+    n = masses.shape[1]
+    steps = times.size
+    stride = 8 * ((n + 2 * _PAD + 7) // 8)
+    w = np.zeros((4 + _RING + 2 * (LONGEST + 1)) * stride)
+    ring = (4 + np.arange(_RING)) * stride + _PAD
+    u = np.zeros(LONGEST + 1, np.int64)
+    v = np.zeros(LONGEST + 1, np.int64)
+    when = np.zeros(LONGEST + 1)  # the time of the state in rows u[j], v[j]
+
+    longest_gap = times[0] - clock[begin, 2]
+    for i in range(1, steps):
+        longest_gap = max(longest_gap, times[i] - times[i - 1])
+    top = _top_order(1.001 * max(REACH, frequencies.max() * longest_gap))
+    bessel = np.empty(top + 1)
+    offsets = np.zeros(LONGEST)  # of the times after an anchor whose coefficients the tables hold
+    terms = np.zeros(LONGEST, np.int64)
+    cosine = np.zeros((LONGEST, 4 * (top // 8 + 1)))
+    drift, slope = np.zeros_like(cosine), np.zeros_like(cosine)
+    twice_cosine, twice_slope = np.zeros_like(cosine), np.zeros_like(cosine)
+
+    realization = -1
+    row = Row(n, periodic, True, _PAD, stride + _PAD, 2 * stride + _PAD, 3 * stride + _PAD, ring)
+    frequency, stiff = 1.0, 1.0
+    for r in range(begin, end):
+        if r // starts != realization:
+            realization = r // starts
+            frequency = frequencies[realization]
+            stiff = 0.25 * frequency * frequency
+            even = True
+            for p in range(n):
+                mass, left, right = masses[realization, p], contacts[realization, p], contacts[realization, p + 1]
+                w[row.mass + p], w[row.contact + p] = mass, left
+                w[row.left + p], w[row.right + p] = left / (mass * stiff), right / (mass * stiff)
+                even = even and left == right
+            w[row.contact + n] = contacts[realization, n]
+            row = Row(n, periodic, even, row.mass, row.contact, row.left, row.right, ring)
+            offsets[:] = -1.0
+        w[ring[0] - _PAD :] = 0.0
+        for j in range(LONGEST + 1):
+            u[j] = (4 + _RING + 2 * j) * stride + _PAD
+            v[j] = u[j] + stride
+        w[u[0] : u[0] + n] = anchors[r, 0]
+        w[v[0] : v[0] + n] = anchors[r, 1]
+        w[u[1] : u[1] + n] = latest[r, 0]
+        w[v[1] : v[1] + n] = latest[r, 1]
+        anchor, since = clock[r, 0], int(clock[r, 1])
+        when[0], when[1] = anchor, clock[r, 2]
+        if clock[r, 3] < 0:
+            clock[r, 3] = _start_energy(w, row, u[0], v[0])
+        limit = TRIM * TRIM * clock[r, 3]
+        low, high = _trim(w, row, u[:1], v[:1], 1, stiff, limit, 0, n)
+        start, stop = 0, n
+        reference = 0.5 * (low + 1 + high)
+        here = min(since, 1)  # the row that holds the latest state
+        history = 0  # states on the grid before the anchor, in rows 1, 2, ...
+        age = 0  # mirrored segments since the last plain one
+        i = 0
+        while i < steps:
+            if since > 0 and (since >= LONGEST or frequency * (times[i] - anchor) > REACH):
+                # The latest state becomes the anchor, and those before it follow in order.
+                for j in range((here + 1) // 2):
+                    u[j], u[here - j] = u[here - j], u[j]
+                    v[j], v[here - j] = v[here - j], v[j]
+                    when[j], when[here - j] = when[here - j], when[j]
+                history = here if mirrored else 0
+                low, high = _trim(w, row, u, v, history + 1, stiff, limit, start, stop)
+                anchor, since, here = when[0], 0, 0
+            count = 0
+            if since == 0 and times[i] == anchor:
+                count = 1
+            else:
+                # The times of this segment, with their coefficients unless they are at hand.
+                known = True
+                while i + count < steps and since + count < LONGEST:
+                    ahead = times[i + count] - anchor
+                    if since + count > 0 and frequency * ahead > REACH:
+                        break
+                    slack = _SLACK * times[i + count] if mirrored else 0.0
+                    known = known and abs(ahead - offsets[count]) <= slack
+                    count += 1
+                mirror = mirrored and count <= history and age < RESTART
+                for j in range(count):
+                    if not known:
+                        offsets[j] = times[i + j] - anchor
+                        terms[j] = _coefficients(
+                            frequency, offsets[j], tolerance, bessel, cosine[j], drift[j], slope[j]
+                        )
+                    if mirror and abs((anchor - when[j + 1]) - offsets[j]) > _SLACK * times[i + j]:
+                        mirror = False
+                if not known:
+                    twice_cosine[:] = 2.0 * cosine
+                    twice_slope[:] = 2.0 * slope
+                if periodic:
+                    _close(w, row, u[0])
+                    _close(w, row, v[0])
+                if mirror:
+                    age += 1
+                    start, stop = _expand(
+                        w, row, u[0], low, high, count, u[1:], v[1:], terms, twice_cosine, twice_slope, -1.0, 1.0
+                    )
+                else:
+                    age, keep = 0, 0.0
+                    if not _silent(w, v[0], low, high):
+                        start, stop = _expand(
+                            w, row, v[0], low, high, count, u[1:], v[1:], terms, drift, cosine, 0.0, 0.0
+                        )
+                        keep = 1.0
+                    if keep == 0.0 or not _silent(w, u[0], low, high):
+                        start, stop = _expand(
+                            w, row, u[0], low, high, count, u[1:], v[1:], terms, cosine, slope, keep, keep
+                        )
+                for j in range(count):
+                    when[j + 1] = anchor + offsets[j] if mirrored else times[i + j]
+                since += count
+                here = count
+            for j in range(count):
+                at = j + 1 if since > 0 else 0
+                if periodic:
+                    _close(w, row, u[at])
+                if kind in (SITE_MOMENTS, BOND_MOMENTS):
+                    first, last = (start, stop) if since > 0 else (low, high)
+                    reference = _record_moments(w, row, u[at], v[at], kind, first, last, reference, moments[r, i + j])
+                else:
+                    _record_fields(w, row, u[at], v[at], kind, fields, r, i + j)
+            i += count
+        anchors[r, 0], anchors[r, 1] = w[u[0] : u[0] + n], w[v[0] : v[0] + n]
+        latest[r, 0], latest[r, 1] = w[u[here] : u[here] + n], w[v[here] : v[here] + n]
+        clock[r, 0], clock[r, 1], clock[r, 2] = anchor, since, times[steps - 1]
+
+
+@_kernel
+def bin_spectra(begin, end, spectra, kind, strain, tones_per_band, bands, totals):
+    """Energies of wavenumbers (Eq. 43) summed into bands (Eq. 44) for states begin to end - 1.
+
+    Args:
+        begin, end: states.
+        spectra: transforms (field, state, wavenumber) of the fields that :func:`march` leaves, without a factor.
+        kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS.
+        strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, (wavenumber,).
+        tones_per_band: wavenumbers in a band.
+        bands: (state, band), written.
+        totals: energy over all wavenumbers, (state,), written.
+    """
+    count = spectra.shape[2]
+    n = 2 * (count - 1)
+    energy = np.empty(count)
+    for s in range(begin, end):
+        a, b, c = spectra[0, s], spectra[1, s], spectra[min(2, spectra.shape[0] - 1), s]
+        if kind == UNIFORM_FIELDS:
+            for k in range(count):
+                bound = c[k].real * c[k].real + c[k].imag * c[k].imag
+                energy[k] = a[k].real * b[k].real + a[k].imag * b[k].imag + strain[k] * bound
+        elif kind == SITE_FIELDS:
+            d = spectra[3, s]
+            for k in range(count):
+                moving = a[k].real * b[k].real + a[k].imag * b[k].imag
+                energy[k] = moving + c[k].real * d[k].real + c[k].imag * d[k].imag
+        else:
+            for k in range(count):
+                moving = a[k].real * a[k].real + a[k].imag * a[k].imag
+                energy[k] = moving + b[k].real * b[k].real + b[k].imag * b[k].imag
+        # Half for the energy, 1/N for the unitary transform; k and -k are two, except where they are one.
+        energy[0] *= 0.5
+        energy[count - 1] *= 0.5
+        total = energy[0]
+        for band in range(bands.shape[1]):
+            part = 0.0
+            for k in range(1 + band * tones_per_band, 1 + (band + 1) * tones_per_band):
+                part += energy[k]
+            bands[s, band] = part / n
+            total += part
+        totals[s] = total / n
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Chains and their starts, laid out for the kernels.
+
+    Attributes:
+        masses: (realization, particle), float64.
+        contacts: (realization, N + 1), float64; on a ring the last contact is the first again.
+        frequencies: W, (realization,), float64.
+        displacement, velocity: (row, particle), float64; row r starts realization r // starts.
+        starts: rows per realization.
+        periodic: whether the chains are rings.
+        tolerance: largest sum of dropped coefficients in a segment.
+    """
+
+    masses: np.ndarray
+    contacts: np.ndarray
+    frequencies: np.ndarray
+    displacement: np.ndarray
+    velocity: np.ndarray
+    starts: int
+    periodic: bool
+    tolerance: float
+
+    @property
+    def count(self) -> int:
+        return len(self.displacement)
+
+    def part(self, begin: int, end: int) -> Rows:
+        """The rows of realizations begin to end - 1."""
+        rows = slice(begin * self.starts, end * self.starts)
+        return replace(
+            self,
+            masses=self.masses[begin:end],
+            contacts=self.contacts[begin:end],
+            frequencies=self.frequencies[begin:end],
+            displacement=self.displacement[rows],
+            velocity=self.velocity[rows],
+        )
+
+
+class March:
+    """Rows on their way through time; each call takes the next window of times."""
+
+    def __init__(self, rows: Rows, mirrored: bool = False) -> None:
+        self.rows = rows
+        self.mirrored = mirrored
+        self.anchors = np.stack([rows.displacement, rows.velocity], axis=1)
+        self.latest = np.zeros_like(self.anchors)
+        self.clock = np.zeros((rows.count, 4))
+        self.clock[:, 3] = -1
+
+    def fields(self, times: np.ndarray, kind: int, out: np.ndarray, pool: Executor | None = None) -> None:
+        """Leaves the states or fields of the kind in ``out``, (field, row, time, particle)."""
+        self._run(times, kind, out, np.empty((0, 0, 3)), pool)
+
+    def moments(self, times: np.ndarray, kind: int, pool: Executor | None = None) -> np.ndarray:
+        """Total, center and width of the energy, (row, time, 3)."""
+        moments = np.empty((self.rows.count, len(times), 3))
+        self._run(times, kind, np.empty((0, 0, 0, 0)), moments, pool)
+        return moments
+
+    def _run(
+        self, times: np.ndarray, kind: int, fields: np.ndarray, moments: np.ndarray, pool: Executor | None
+    ) -> None:
+        rows = self.rows
+
+        def task(begin: int, end: int) -> None:
+            march(
+                begin, end, rows.masses, rows.contacts, rows.frequencies, rows.starts, rows.periodic, times,
+                rows.tolerance, self.mirrored, kind, self.anchors, self.latest, self.clock, fields, moments,
+            )  # fmt: skip
+
+        share(task, rows.count, pool)
+
+
+def workers() -> ThreadPoolExecutor:
+    """Threads for :func:`share`, as many as torch uses."""
+    return ThreadPoolExecutor(torch.get_num_threads())
+
+
+def share(task: Callable[[int, int], None], count: int, pool: Executor | None = None) -> None:
+    """Runs task(begin, end) over 0 to count - 1 in threads, in a few pieces for each."""
+    threads = torch.get_num_threads()
+    if threads == 1 or count == 1:
+        task(0, count)
+        return
+    edges = np.unique(np.linspace(0, count, 4 * threads + 1).astype(int))
+    own = workers() if pool is None else contextlib.nullcontext(pool)
+    with own as executor:
+        list(executor.map(task, edges[:-1].tolist(), edges[1:].tolist()))
