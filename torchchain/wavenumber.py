@@ -12,7 +12,7 @@ from torchchain.bands import bin_energy, check_bands
 from torchchain.chain import Chain
 from torchchain.energy import DEFINITIONS, EnergyMatrices, require_linear
 from torchchain.evolvers.method import Trajectory
-from torchchain.evolvers.modes import align_modes, modal_amplitudes
+from torchchain.evolvers.modes import change_basis, modal_amplitudes
 from torchchain.excitation import State
 from torchchain.spectrum import NormalModes, normal_modes
 
@@ -65,8 +65,7 @@ def _transform(field: Tensor) -> Tensor:
 
 def _product(a: Tensor, b: Tensor) -> Tensor:
     """Re(a conj(b)), without forming the imaginary part."""
-    x, y = torch.view_as_real(a), torch.view_as_real(b)
-    return (x * y).sum(-1)
+    return a.real * b.real + a.imag * b.imag
 
 
 def wavenumber_energy_matrix(matrices: EnergyMatrices) -> Tensor:
@@ -142,7 +141,7 @@ def long_time_band_energy(
     energy = (swing.square() + velocity.square()) / 2
     shapes = modes.shapes.mT
     moment, wave = _transform(chain.masses[..., None, :] * shapes), _transform(shapes)
-    bands = (energy[..., None, :] @ align_modes(chain, _band_weight(moment, wave, n_bands), energy))[..., 0, :]
+    bands = change_basis(energy, _band_weight(moment, wave, n_bands))
     # Cross terms of neighboring modes of one frequency; a chain has at most two modes of one frequency.
     gap = modes.frequencies.diff(dim=-1)
     equal = gap <= 64 * torch.finfo(gap.dtype).eps * modes.frequencies[..., -1:]
@@ -152,7 +151,7 @@ def long_time_band_energy(
         weight = _band_weight(moment[..., 1:, :], wave[..., :-1, :], n_bands) + _band_weight(
             moment[..., :-1, :], wave[..., 1:, :], n_bands
         )
-        bands = bands + (cross[..., None, :] @ align_modes(chain, weight, cross))[..., 0, :] / 2
+        bands = bands + change_basis(cross, weight) / 2
     if not normalize:
         return bands
     total = energy.sum(-1, keepdim=True)

@@ -16,11 +16,20 @@ from torchchain.spectrum import NormalModes, normal_modes
 def modal_amplitudes(chain: Chain, state: State, modes: NormalModes) -> tuple[Tensor, Tensor]:
     """Displacement and velocity in the basis of the modes, each (*batch, *any, mode); S^-1 = S^T M (Eq. 18)."""
     masses = chain.align(chain.masses, state.displacement)
-    shapes = align_modes(chain, modes.shapes, state.displacement)
     return (
-        ((masses * state.displacement)[..., None, :] @ shapes)[..., 0, :],
-        ((masses * state.velocity)[..., None, :] @ shapes)[..., 0, :],
+        change_basis(masses * state.displacement, modes.shapes),
+        change_basis(masses * state.velocity, modes.shapes),
     )
+
+
+def change_basis(field: Tensor, basis: Tensor) -> Tensor:
+    """field @ basis, (*batch, *any, y), from a field (*batch, *any, x) and one basis (*batch, x, y) per chain.
+
+    The axes between are rows of a single product: broadcasting would copy the basis for each of them.
+    """
+    batch = basis.shape[:-2]
+    rows = field.reshape(*batch, -1, field.shape[-1])
+    return (rows @ basis).reshape(*field.shape[:-1], basis.shape[-1])
 
 
 def align_modes(chain: Chain, shapes: Tensor, field: Tensor) -> Tensor:
@@ -33,20 +42,25 @@ def start(chain: Chain, state: State, modes: NormalModes | None = None) -> Advan
     """See the registry entry below."""
     modes = normal_modes(chain) if modes is None else modes
     displacement, velocity = (z[..., None, :] for z in modal_amplitudes(chain, state, modes))
-    shapes = align_modes(chain, modes.shapes, state.displacement).mT
+    back = modes.shapes.mT
     frequency = chain.align(modes.frequencies, state.displacement)[..., None, :]
+    moves = state.velocity.requires_grad or bool((state.velocity != 0).any())
+    displaced = state.displacement.requires_grad or bool((state.displacement != 0).any())
 
     def advance(times: Tensor) -> Trajectory:
         t = times.to(state.displacement)[:, None]
         phase = frequency * t
-        cosine, sine = phase.cos(), phase.sin()
-        # sin(w t) / w, which is t for the zero mode of a periodic chain (Eq. 21 divides by its w = 0)
-        drift = t * torch.sinc(phase / math.pi)
-        return Trajectory(
-            times,
-            (cosine * displacement + drift * velocity) @ shapes,
-            (cosine * velocity - frequency * sine * displacement) @ shapes,
-        )
+        cosine = phase.cos()
+        position = speed = torch.zeros_like(displacement)
+        if displaced:
+            position = cosine * displacement
+            speed = (-frequency * phase.sin()) * displacement
+        if moves:
+            # sin(w t) / w, which is t for the zero mode of a periodic chain (Eq. 21 divides by its w = 0)
+            position = position + (t * torch.sinc(phase / math.pi)) * velocity
+            speed = speed + cosine * velocity
+        shape = torch.broadcast_shapes(position.shape, phase.shape)
+        return Trajectory(times, change_basis(position.expand(shape), back), change_basis(speed.expand(shape), back))
 
     return advance
 
