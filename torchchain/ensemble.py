@@ -297,7 +297,13 @@ def coordinates(scene: Scene, axes: set[str]) -> dict[str, Any]:
         "band": ("band", np.arange(1, scene.n_bands + 1), {"long_name": "wavenumber band r"}),
         "wavenumber": ("wavenumber", 2 * np.pi / n * np.arange(n // 2 + 1), k),
     }
-    return {name: every[name] for name in every if name in axes}
+    chosen = {name: every[name] for name in every if name in axes}
+    if scene.si is not None and "time" in axes:
+        chosen["time_si"] = ("time", scene.si.to_si("time", scene.times).numpy(), {"units": "s", "long_name": "time t"})
+    if scene.si is not None and "particle" in axes:
+        place = scene.si.spacing * np.arange(1, n + 1)
+        chosen["place_si"] = ("particle", place, {"units": "m", "long_name": "rest position of the particle"})
+    return chosen
 
 
 def scene_attributes(scene: Scene) -> dict[str, Any]:

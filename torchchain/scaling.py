@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 from torchchain import checks
 
@@ -88,10 +89,10 @@ class Scaling:
             "damping": stiffness * time,
         }[quantity]
 
-    def to_si(self, quantity: str, value: float) -> float:
+    def to_si(self, quantity: str, value: Any) -> Any:
         """A dimensionless value in SI units; tensors and arrays pass through."""
         return value * self.unit(quantity)
 
-    def from_si(self, quantity: str, value: float) -> float:
+    def from_si(self, quantity: str, value: Any) -> Any:
         """A value in SI units made dimensionless; tensors and arrays pass through."""
         return value / self.unit(quantity)

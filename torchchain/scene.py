@@ -19,6 +19,7 @@ from torchchain.bands import center_tones, check_bands
 from torchchain.chain import BOUNDARIES, CONTACTS, Chain
 from torchchain.disorder import Disorder
 from torchchain.excitation import Impulse, StandingWave, State
+from torchchain.scaling import Scaling
 
 OBSERVABLES = (
     "band_energy",
@@ -55,6 +56,7 @@ class Scene:
         contact: "linear" or "hertz".
         damping: contact damping coefficient.
         energy_definition: "site" (Eqs. 36, 42) or "bond" (Eq. A3).
+        si: the beads in SI units, for results in seconds and meters; None to stay dimensionless.
 
     Raises:
         FieldError, FieldTypeError: one line with the field, the rule and the value.
@@ -74,6 +76,7 @@ class Scene:
     contact: str = "linear"
     damping: float = 0.0
     energy_definition: str = "site"
+    si: Scaling | None = None
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:
@@ -91,6 +94,8 @@ class Scene:
             raise checks.FieldTypeError(
                 f"stiffness_disorder must be a table, got {checks.shown(self.stiffness_disorder)}"
             )
+        if self.si is not None and not isinstance(self.si, Scaling):
+            raise checks.FieldTypeError(f"si must be a table, got {checks.shown(self.si)}")
         put("times", checks.times("times", self.times).to(torch.float64))
         if self.tolerance is not None:
             put("tolerance", checks.number("tolerance", self.tolerance, above=0, below=1))
@@ -161,7 +166,7 @@ class Scene:
             elif entry.name == "excitation":
                 kind = "impulse" if isinstance(value, Impulse) else "standing_wave"
                 value = {"kind": kind, **_plain(value)}
-            elif isinstance(value, Disorder):
+            elif isinstance(value, (Disorder, Scaling)):
                 value = _plain(value)
             elif isinstance(value, tuple):
                 value = list(value)
@@ -175,9 +180,15 @@ class Scene:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Scene:
-        """A scene from the plain values of a scene file; an unknown key is an error."""
+        """A scene from the plain values of a scene file; an unknown key is an error.
+
+        The table ``si`` holds the beads (see :class:`Scaling`) and may state ``times`` in seconds, ``velocity`` in
+        m/s, ``amplitude`` in meters and ``damping`` in kg/s, in place of the dimensionless fields.
+        """
         checks.known_keys("scene", plain, [entry.name for entry in dataclasses.fields(cls)])
         fields = dict(plain)
+        if "si" in fields:
+            fields = _made_dimensionless(fields)
         for name in ("disorder", "stiffness_disorder"):
             if name in fields:
                 fields[name] = _from_table(name, fields[name], Disorder)
@@ -186,15 +197,9 @@ class Scene:
             kind = checks.choice("excitation.kind", table.pop("kind", "standing_wave"), EXCITATIONS)
             fields["excitation"] = _from_table("excitation", table, EXCITATIONS[kind])
         if isinstance(fields.get("times"), Mapping):
-            table = _table("times", fields["times"])
-            checks.known_keys("times", table, ("start", "stop", "step"))
-            for key in ("stop", "step"):
-                if key not in table:
-                    raise checks.fail("times", f"have {key}", dict(table))
-            fields["times"] = regular_times(table.get("start", 0.0), table["stop"], table["step"])
-        for name in ("observables",):
-            if isinstance(fields.get(name), list):
-                fields[name] = tuple(fields[name])
+            fields["times"] = _times_from_table(fields["times"])
+        if isinstance(fields.get("observables"), list):
+            fields["observables"] = tuple(fields["observables"])
         return cls(**fields)
 
     @classmethod
@@ -223,6 +228,46 @@ def regular_times(start: float, stop: float, step: float) -> Tensor:
     if count >= 10**8:
         raise checks.fail("times.step", "give fewer than 100000000 times", step)
     return start + step * torch.arange(int(count) + 1, dtype=torch.float64)
+
+
+def _times_from_table(value: Any) -> Tensor:
+    table = _table("times", value)
+    checks.known_keys("times", table, ("start", "stop", "step"))
+    for key in ("stop", "step"):
+        if key not in table:
+            raise checks.fail("times", f"have {key}", dict(table))
+    return regular_times(table.get("start", 0.0), table["stop"], table["step"])
+
+
+def _made_dimensionless(fields: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a scene file whose table ``si`` states some of them in SI units."""
+    table = _table("si", fields["si"])
+    given = {name: table.pop(name) for name in ("times", "velocity", "amplitude", "damping") if name in table}
+    missing = [entry.name for entry in dataclasses.fields(Scaling) if entry.name not in table]
+    if missing:
+        raise checks.fail("si", f"have {', '.join(missing)}", table)
+    scaling = _from_table("si", table, Scaling)
+    fields = {**fields, "si": scaling}
+    if "times" in given:
+        times = given["times"]
+        times = _times_from_table(times) if isinstance(times, Mapping) else checks.times("si.times", times)
+        _only_once("times", fields)
+        fields["times"] = scaling.from_si("time", times)
+    if "damping" in given:
+        _only_once("damping", fields)
+        fields["damping"] = scaling.from_si("damping", checks.number("si.damping", given["damping"], at_least=0))
+    for name, quantity in (("velocity", "velocity"), ("amplitude", "length")):
+        if name in given:
+            excitation = _table("excitation", fields.get("excitation", {}))
+            _only_once(name, excitation)
+            excitation[name] = scaling.from_si(quantity, checks.number(f"si.{name}", given[name]))
+            fields["excitation"] = excitation
+    return fields
+
+
+def _only_once(name: str, fields: Mapping[str, Any]) -> None:
+    if name in fields:
+        raise checks.fail(name, f"be given once, here or as si.{name}", fields[name])
 
 
 def _times_table(times: Tensor) -> Any:

@@ -55,33 +55,32 @@ class MomentTree:
     """
 
     def __init__(self) -> None:
-        self.waiting: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+        self.waiting: dict[tuple[int, int], tuple[Tensor, Tensor | None]] = {}  # a leaf has no squares
         self.count = 0
 
     def add(self, first: int, values: Tensor) -> None:
         """Take in realizations first, first + 1, ...; values (realization, ...)."""
         self.count += len(values)
-        level, start, mean, squares = 0, first, values, torch.zeros_like(values)
-        while len(mean):
+        level, start = 0, first
+        mean, squares = list(values.unbind()), [None] * len(values)
+        while mean:
             if start % 2:
                 left = self.waiting.pop((level, start - 1), None)
                 if left is None:
-                    self.waiting[level, start] = (mean[0].clone(), squares[0].clone())
-                    mean, squares, start = mean[1:], squares[1:], start + 1
+                    self.waiting[level, start] = (mean.pop(0).clone(), squares.pop(0))
+                    start += 1
                 else:
-                    mean, squares = torch.cat([left[0][None], mean]), torch.cat([left[1][None], squares])
-                    start -= 1
+                    mean, squares, start = [left[0], *mean], [left[1], *squares], start - 1
             if len(mean) % 2:
                 last = start + len(mean) - 1
                 right = self.waiting.pop((level, last + 1), None)
                 if right is None:
-                    self.waiting[level, last] = (mean[-1].clone(), squares[-1].clone())
-                    mean, squares = mean[:-1], squares[:-1]
+                    self.waiting[level, last] = (mean.pop().clone(), squares.pop())
                 else:
-                    mean, squares = torch.cat([mean, right[0][None]]), torch.cat([squares, right[1][None]])
-            difference = mean[1::2] - mean[0::2]
-            squares = squares[0::2] + squares[1::2] + difference * difference * (2.0**level / 2)
-            mean = mean[0::2] + difference / 2
+                    mean, squares = [*mean, right[0]], [*squares, right[1]]
+            pairs = range(0, len(mean), 2)
+            merged = [_merge_equal(mean[i], squares[i], mean[i + 1], squares[i + 1], 2.0**level) for i in pairs]
+            mean, squares = [m for m, _ in merged], [s for _, s in merged]
             level, start = level + 1, start // 2
 
     def result(self) -> Moments:
@@ -89,8 +88,22 @@ class MomentTree:
         nodes = sorted(self.waiting.items(), key=lambda item: item[0][1] << item[0][0])
         if not nodes:
             raise ValueError("no realizations were taken in")
-        parts = [Moments(2**level, mean, squares) for (level, _), (mean, squares) in nodes]
+        parts = [
+            Moments(2**level, mean, torch.zeros_like(mean) if squares is None else squares)
+            for (level, _), (mean, squares) in nodes
+        ]
         total = parts[0]
         for part in parts[1:]:
             total = total.merge(part)
         return total
+
+
+def _merge_equal(
+    mean: Tensor, squares: Tensor | None, other_mean: Tensor, other_squares: Tensor | None, count: float
+) -> tuple[Tensor, Tensor]:
+    """Mean and squares of two nodes of ``count`` realizations each."""
+    difference = other_mean - mean
+    total = difference.square().mul_(count / 2)
+    if squares is not None and other_squares is not None:
+        total = (squares + other_squares).add_(total)
+    return difference.div_(2).add_(mean), total
