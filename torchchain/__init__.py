@@ -14,6 +14,7 @@ _HOME = {
     "Disorder": "disorder",
     "Impulse": "excitation",
     "METHODS": "evolvers",
+    "MemoryModel": "master",
     "MasterEquation": "master",
     "NormalModes": "spectrum",
     "Plan": "planning",

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeGuard
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +28,8 @@ def shown(value: Any, width: int = 80) -> str:
 
 def fail(field: str, rule: str, value: Any) -> FieldError:
     """The error for a ``field`` whose ``value`` breaks the ``rule``, to be raised by the caller."""
-    return FieldError(f"{field} must {rule}, got {value if isinstance(value, str) else shown(value)}")
+    message = f"{field} must {rule}, got {value if isinstance(value, str) else shown(value)}"
+    return FieldError(" ".join(message.split()))  # one line, whatever is in a path
 
 
 def integer(field: str, value: Any, minimum: int | None = None, maximum: int | None = None) -> int:
@@ -90,18 +92,35 @@ def known_keys(field: str, given: Iterable[str], allowed: Iterable[str]) -> None
 
 
 def real_tensor(field: str, value: Any) -> Tensor:
-    """The value as a finite tensor of real floating-point numbers (float64 unless it is a tensor)."""
+    """The value as a finite tensor of float32 or float64 (float64 unless it is a tensor of either)."""
     if not isinstance(value, Tensor):
-        try:
-            value = torch.as_tensor(value, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError):
-            raise FieldTypeError(f"{field} must be real numbers, got {shown(value)}") from None
+        value = _float64_tensor(field, value)
     if not value.is_floating_point():
         if value.is_complex() or value.dtype == torch.bool:
             raise FieldTypeError(f"{field} must be real floating-point numbers, got dtype {value.dtype}")
         value = value.to(torch.float64)
+    if value.dtype not in (torch.float32, torch.float64):
+        raise FieldTypeError(f"{field} must be of dtype float32 or float64, got {value.dtype}")
     first_bad(field, "be finite", value, ~torch.isfinite(value))
     return value
+
+
+def _float64_tensor(field: str, value: Any) -> Tensor:
+    """Numbers, nested lists or an array of them as a tensor; truth values and complex numbers are an error."""
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "iufO" or (array.dtype.kind == "O" and None in array):
+            raise TypeError
+        return torch.from_numpy(array.astype(np.float64, copy=True))
+    except OverflowError:  # an integer beyond float64
+        raise fail(field, "be finite", value) from None
+    except (TypeError, ValueError, RuntimeError):
+        raise FieldTypeError(f"{field} must be real numbers, got {shown(value)}") from None
+
+
+def is_collection(value: Any) -> TypeGuard[Iterable[Any]]:
+    """Whether the value is several values in an order: not a number, and not an array without axes."""
+    return isinstance(value, Iterable) and getattr(value, "ndim", 1) != 0
 
 
 def first_bad(field: str, rule: str, values: Tensor, bad: Tensor, axis: str = "position") -> None:

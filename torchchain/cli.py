@@ -119,9 +119,9 @@ class Calibrate(SceneFlags):
     method: str = "auto"
     """how to evolve the chains; auto for the plan's choice"""
     fit: str | None = None
-    """adam (default), linear, nonlinear or analytic"""
+    """analytic, linear, nonlinear, adam or projection (default: the best for the model)"""
     model: str | None = None
-    """rate model; none for the most accurate"""
+    """paper, exact_psi, basis_matrix or memory (default: the most accurate)"""
     window: tuple[float, float] | None = None
     """first and last time of the short-time fits (default 0.5 2)"""
     constraint: str | None = None
@@ -180,15 +180,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         from torchchain import commands  # torch and the rest, once the flags are known to be good
         from torchchain.checks import FieldError, FieldTypeError
-        from torchchain.master.solvers import IntegrationError
-        from torchchain.spectrum import DecompositionError
 
         try:
             return commands.run(flags, arguments)
         except (FieldError, FieldTypeError) as error:
             return _complain(str(error), 2)
-        except (DecompositionError, IntegrationError) as error:
-            return _complain(str(error), 1)
+        except (RuntimeError, MemoryError) as error:  # a solver that gives up, or no memory left
+            return _complain(str(error) or type(error).__name__, 1)
     except KeyboardInterrupt:
         return _complain("interrupted, nothing was written", 130)
 
@@ -214,7 +212,7 @@ def _parse(arguments: list[str]) -> Any:
 def _one_line(report: str) -> str:
     """The parser's boxed report as one line: flag, rule, value."""
     lines = [line.strip("│╭╮╰╯─ ").strip() for line in report.splitlines()]
-    text = " ".join(line for line in lines if line)
+    text = " ".join(line for line in lines if line.strip("-"))
     text = re.sub(r"\s*(For full helptext|Argument helptext|Got errors).*", "", text)
     value = re.search(r"Error parsing (\S+): .*?no type matching (.*?) could be instantiated from \[(.*?)\]", text)
     if value:

@@ -61,10 +61,12 @@ def _scene(flags: SceneFlags, tables: tuple[str, ...] = ()) -> tuple[Scene, dict
 
 def _device(name: str) -> str:
     try:
-        torch.empty(0, device=torch.device(name))
+        kind = torch.empty(0, device=torch.device(name)).device.type
     except (RuntimeError, AssertionError) as error:
         raise checks.fail("device", "be available here", f"{name!r}: {str(error).splitlines()[0][:100]}") from None
-    return name
+    if kind not in ("cpu", "cuda"):
+        raise checks.fail("device", "be cpu, cuda or cuda:<number>", repr(name))
+    return "cpu" if kind == "cpu" else name
 
 
 def _figure(width: float, height: float, rows: int, columns: int) -> Any:
@@ -143,10 +145,10 @@ def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
     began = time.time()
     scene, extra = _scene(flags, ("calibration",))
     settings = _merge(extra.get("calibration", {}), flags.calibration())
-    checks.known_keys("calibration", settings, ("method", "model", "window", "constraint", "penalty", "steps", "learning_rate", "tolerance"))  # fmt: skip
-    settings["method"] = settings.get("method", "adam")
-    if "window" in settings:
-        settings["window"] = tuple(settings["window"])
+    checks.known_keys("calibration", settings, ("method", "model", "window", "constraint", "penalty", "steps", "learning_rate", "tolerance", "order"))  # fmt: skip
+    for name in ("window", "order"):
+        if isinstance(settings.get(name), list):
+            settings[name] = tuple(settings[name])
     out, device = outputs.check_writable(flags.out), _device(flags.device)
     checks.choice("method", flags.method, ("auto", *METHODS))
     stages = Stages()
@@ -163,7 +165,8 @@ def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
     data = transfer.to_dataset()
     data["prediction"] = data["band_energy"].copy(data=predicted.numpy())
     data["prediction"].attrs["long_name"] = "share of the energy predicted by the master equation"
-    chosen = {**settings, "model": master.calibration.model, "window": list(master.calibration.window or ())}
+    done = master.calibration
+    chosen = {**settings, "method": done.method, "model": done.model, "window": list(done.window or ())}
     config = transfer.scene.to_toml() + "\n" + tomli_w.dumps({"calibration": chosen})
     with stages("writing"):
         outputs.write(
@@ -207,10 +210,14 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
     ]
     if bool(early.any()):
         rows.append((f"total variation to the ensemble, 0 < t <= {end / 2:g}", float(distance[:, early].mean())))
-    rows.append((f"total variation to the ensemble, {end / 2:g} < t <= {end:g}", float(distance[:, late].mean())))
-    rows.append(
-        ("statistical error: total variation of two such ensembles", float(statistical[:, transfer.times > 0].mean()))
-    )
+    if bool(late.any()):
+        rows.append((f"total variation to the ensemble, {end / 2:g} < t <= {end:g}", float(distance[:, late].mean())))
+        rows.append(
+            (
+                "statistical error: total variation of two such ensembles",
+                float(statistical[:, transfer.times > 0].mean()),
+            )
+        )
     rows.append(
         ("masses: realized mean, standard deviation", "{mass_mean:.5f}, {mass_sd:.5f}".format(**transfer.attributes))
     )

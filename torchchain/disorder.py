@@ -14,6 +14,7 @@ from torchchain import checks
 
 KINDS = ("normal", "uniform", "binary", "lognormal", "gamma")
 _MASSES, _STIFFNESSES = 0, 1  # the random streams of a realization
+_NEGLIGIBLE = 1e-20  # a strength below the resolution of a float64 next to 1
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Disorder:
     @property
     def redrawn_fraction(self) -> float:
         """Share of draws that fall below ``lower`` and are drawn again."""
-        return 0.0 if self.strength == 0 else float(self._cumulative(np.float64(self.lower)))
+        return 0.0 if self.strength < _NEGLIGIBLE else float(self._cumulative(np.float64(self.lower)))
 
     def masses(self, n_particles: int, realizations: int | Iterable[int], seed: int) -> Tensor:
         """Masses in units of the mean mass.
@@ -73,7 +74,7 @@ class Disorder:
 
     def _sample(self, size: int, realizations: int | Iterable[int], seed: int, stream: int) -> Tensor:
         seed = checks.integer("seed", seed, 0, 2**64 - 1)
-        if isinstance(realizations, Iterable):
+        if checks.is_collection(realizations):
             numbers = [checks.integer("realizations", i, 0, 2**63) for i in realizations]
         else:
             numbers = list(range(checks.integer("realizations", realizations, 1)))
@@ -86,7 +87,7 @@ class Disorder:
     def _quantile(self, uniform: np.ndarray) -> np.ndarray:
         """Inverse of the distribution function of the values at or above ``lower``."""
         xi = self.strength
-        if xi == 0:
+        if xi < _NEGLIGIBLE:
             return np.ones_like(uniform)
         below = self.redrawn_fraction
         uniform = below + (1 - below) * uniform

@@ -97,6 +97,7 @@ def energy_center(energy: Tensor) -> Tensor:
     Raises:
         FieldError: if the total energy of a state is not positive.
     """
+    energy = _per_particle(energy)
     return (energy @ _sites(energy)) / _positive_total(energy)
 
 
@@ -105,8 +106,16 @@ def energy_width(energy: Tensor) -> Tensor:
 
     Not a square root: the paper's r^2. Takes and raises what :func:`energy_center` does.
     """
+    energy = _per_particle(energy)
     offset = _sites(energy) - energy_center(energy)[..., None]
     return (offset.square() * energy).sum(-1) / _positive_total(energy)
+
+
+def _per_particle(energy: Tensor) -> Tensor:
+    energy = checks.real_tensor("energy", energy)
+    if energy.ndim == 0:
+        raise checks.fail("energy", "have particles on its last axis", "shape ()")
+    return energy
 
 
 def _sites(energy: Tensor) -> Tensor:
@@ -115,5 +124,5 @@ def _sites(energy: Tensor) -> Tensor:
 
 def _positive_total(energy: Tensor) -> Tensor:
     total = energy.sum(-1)
-    checks.first_bad("total energy", "be positive", total, ~(total > 0), "time")
+    checks.first_bad("total energy", "be positive and finite", total, ~((total > 0) & total.isfinite()), "time")
     return total

@@ -131,7 +131,9 @@ class Chunk:
         """Infinite-time average of the normalized band energies, (realization, [tone,] band)."""
         modes = self.modes
         with self.stages("long-time average"):
-            return long_time_band_energy(self.chain, self.state, self.scene.n_bands, modes=modes)
+            return long_time_band_energy(
+                self.chain, self.state, self.scene.n_bands, modes=modes, definition=self.scene.energy_definition
+            )
 
 
 def stream(

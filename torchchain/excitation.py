@@ -31,6 +31,8 @@ class State:
                 f"have the displacement's shape {tuple(self.displacement.shape)}",
                 f"shape {tuple(self.velocity.shape)}",
             )
+        if self.displacement.ndim == 0:
+            raise checks.fail("displacement", "have particles on its last axis", "shape ()")
 
     def __add__(self, other: State) -> State:
         """The superposition of two states."""
@@ -68,7 +70,8 @@ def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float 
         State (*batch, particle), or (*batch, tone, particle) for a sequence.
     """
     n = chain.n_particles
-    tones = [tone] if isinstance(tone, int) else list(tone)
+    several = checks.is_collection(tone)
+    tones = list(tone) if checks.is_collection(tone) else [tone]
     if not tones:
         raise checks.fail("tone", "hold at least one tone", "none")
     amplitude = checks.number("amplitude", amplitude)
@@ -77,7 +80,7 @@ def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float 
     particle = torch.arange(1, n + 1)
     turns = torch.stack([(int(m) * particle) % n for m in tones]).to(torch.float64) / n
     wave = amplitude * (torch.sin if phase == "sin" else torch.cos)(2 * math.pi * turns)
-    if isinstance(tone, int):
+    if not several:
         wave = wave[0]
     wave = wave.to(chain.masses).expand(*chain.batch_shape, *wave.shape).clone()
     return State(wave, torch.zeros_like(wave))
@@ -95,6 +98,14 @@ def check_tones(field: str, tones: Sequence[int], n_particles: int, phase: str) 
             )
 
 
+def _size(field: str, value: float) -> float:
+    """The value, if the squares of its energies, which the standard errors need, are numbers of float64."""
+    value = checks.number(field, value)
+    if not 1e-60 <= abs(value) <= 1e60:
+        raise checks.fail(field, "have a size between 1e-60 and 1e60", value)
+    return value
+
+
 @dataclass(frozen=True)
 class Impulse:
     """What a scene says of an impulse; see :func:`impulse`."""
@@ -104,9 +115,7 @@ class Impulse:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "site", checks.integer("excitation.site", self.site, 1))
-        object.__setattr__(self, "velocity", checks.number("excitation.velocity", self.velocity))
-        if self.velocity == 0:
-            raise checks.fail("excitation.velocity", "not be zero", self.velocity)
+        object.__setattr__(self, "velocity", _size("excitation.velocity", self.velocity))
 
     def check(self, n_particles: int) -> None:
         checks.integer("excitation.site", self.site, 1, n_particles)
@@ -137,9 +146,7 @@ class StandingWave:
             if len(set(tones)) < len(tones):
                 raise checks.fail("excitation.tones", "be different", tones)
             object.__setattr__(self, "tones", tones)
-        object.__setattr__(self, "amplitude", checks.number("excitation.amplitude", self.amplitude))
-        if self.amplitude == 0:
-            raise checks.fail("excitation.amplitude", "not be zero", self.amplitude)
+        object.__setattr__(self, "amplitude", _size("excitation.amplitude", self.amplitude))
         checks.choice("excitation.phase", self.phase, PHASES)
 
     def check(self, n_particles: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import platform
 import shlex
@@ -29,11 +30,12 @@ Writer = Callable[[Path], None]
 def check_writable(out: str | Path) -> Path:
     """The output folder's path; an error now, before hours of work, if nothing can be written there."""
     out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise checks.fail("out", "be a folder", str(out))
-    parent = out
-    while not parent.exists():
-        parent = parent.parent
+    with _reported(out):
+        if os.path.lexists(out) and not out.is_dir():
+            raise checks.fail("out", "be a folder", str(out))
+        parent = out
+        while not parent.exists():
+            parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise checks.fail("out", "be writable", str(out))
     return out
@@ -109,7 +111,16 @@ def run_record(
         "git_revision": _git_revision(),
         **more,
     }
-    return text(json.dumps(record, indent=2) + "\n")
+    return text(json.dumps(_strict(record), indent=2, allow_nan=False) + "\n")
+
+
+def _strict(value: Any) -> Any:
+    """The value with infinite and undefined numbers as words, for which JSON has no numbers."""
+    if isinstance(value, dict):
+        return {name: _strict(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(entry) for entry in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _version(name: str) -> str:

@@ -38,6 +38,19 @@ def field_map(
     return ax
 
 
+def log_map(
+    ax: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, xlabel: str, ylabel: str, label: str,
+    title: str = "", floor: float = 1e-4, top: float = 1.0,
+) -> Axes:  # fmt: skip
+    """A share of the energy over two axes (as Figs. 10 and 11), values [x, y], logarithmic colors; less is drawn as the floor."""
+    image = ax.pcolormesh(
+        x, y, np.maximum(values.T, floor), norm=LogNorm(floor, top), shading="nearest", rasterized=True
+    )
+    ax.figure.colorbar(image, ax=ax, label=label, extend="both" if values.max() > top else "min")
+    ax.set(xlabel=xlabel, ylabel=ylabel, title=title)
+    return ax
+
+
 def rate_map(ax: Axes, rates: np.ndarray, title: str = "", top: float | None = None) -> Axes:
     """Rates between bands (as Fig. 17), rates [source, receiver]; the diagonal shows the loss rate -Q_ss."""
     shown = np.where(np.eye(len(rates), dtype=bool), -rates, rates)

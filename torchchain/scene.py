@@ -33,8 +33,11 @@ OBSERVABLES = (
     "width",
 )
 BAND_OBSERVABLES = frozenset({"band_energy", "long_time_band_energy"})
+WAVENUMBER_OBSERVABLES = BAND_OBSERVABLES | {"wavenumber_energy"}
 EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse, "standing_wave": StandingWave}
 LARGEST_CHAIN = 10**8
+MOST_TIMES = 10**7
+LATEST_TIME = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +100,8 @@ class Scene:
         if self.si is not None and not isinstance(self.si, Scaling):
             raise checks.FieldTypeError(f"si must be a table, got {checks.shown(self.si)}")
         put("times", checks.times("times", self.times).to(torch.float64))
+        late = self.times > LATEST_TIME
+        checks.first_bad("times", f"be at most {LATEST_TIME:g}, where rounding blurs phases", self.times, late)
         if self.tolerance is not None:
             put("tolerance", checks.number("tolerance", self.tolerance, above=0, below=1))
         checks.choice("contact", self.contact, CONTACTS)
@@ -105,14 +110,19 @@ class Scene:
         if isinstance(self.observables, str) or not isinstance(self.observables, Sequence) or not self.observables:
             raise checks.FieldTypeError(f"observables must be a list of names, got {checks.shown(self.observables)}")
         put("observables", tuple(checks.choice("observables", name, OBSERVABLES) for name in self.observables))
+        if len(set(self.observables)) < len(self.observables):
+            raise checks.fail("observables", "be different", self.observables)
         self.excitation.check(self.n_particles)
         if self.needs_bands:
             check_bands(self.n_particles, self.n_bands)
             if isinstance(self.excitation, StandingWave):  # the center tone of the last band can be N/2
                 dataclasses.replace(self.excitation, tones=self.tones).check(self.n_particles)
-        if self.contact == "hertz":
-            for name in {*BAND_OBSERVABLES, "wavenumber_energy"} & set(self.observables):
+        for name in WAVENUMBER_OBSERVABLES.intersection(self.observables):
+            if self.contact == "hertz":
                 raise checks.fail("contact", f"be 'linear' for the observable {name}", repr(self.contact))
+            if self.energy_definition == "bond" and self.boundary == "fixed":
+                raise checks.fail("boundary", f"be 'periodic' for the observable {name} by 'bond'", repr(self.boundary))
+        if self.contact == "hertz":
             if self.energy_definition == "site":
                 put("energy_definition", "bond")  # the only one that a Hertz contact has
         if self.damping > 0 and "long_time_band_energy" in self.observables:
@@ -213,7 +223,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     try:
         with open(path, "rb") as file:
             return tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # broken syntax or encoding, an endless number, bottomless nesting
         raise checks.fail(f"config {path}", "be a TOML file", f"{error}") from None
     except OSError as error:
         raise checks.fail(f"config {path}", "be a readable file", f"{error.strerror or error}") from None
@@ -225,8 +235,8 @@ def regular_times(start: float, stop: float, step: float) -> Tensor:
     stop = checks.number("times.stop", stop, at_least=start)
     step = checks.number("times.step", step, above=0)
     count = (stop - start) / step * (1 + 1e-12) + 1e-9
-    if count >= 10**8:
-        raise checks.fail("times.step", "give fewer than 100000000 times", step)
+    if count >= MOST_TIMES:
+        raise checks.fail("times.step", f"give fewer than {MOST_TIMES} times", step)
     return start + step * torch.arange(int(count) + 1, dtype=torch.float64)
 
 
@@ -275,7 +285,7 @@ def _times_table(times: Tensor) -> Any:
     if len(times) > 2:
         start, step = float(times[0]), float(times[1] - times[0])
         stop = float(times[-1])
-        if stop / step < 10**7 and torch.equal(regular_times(start, stop, step), times):
+        if stop / step < MOST_TIMES and torch.equal(regular_times(start, stop, step), times):
             return {"start": start, "stop": stop, "step": step}
     return times.tolist()
 
@@ -294,7 +304,12 @@ def _table(field_name: str, value: Any) -> dict[str, Any]:
 def _from_table(field_name: str, value: Any, kind: type) -> Any:
     table = _table(field_name, value)
     checks.known_keys(field_name, table, [entry.name for entry in dataclasses.fields(kind)])
-    return kind(**table)
+    try:
+        return kind(**table)
+    except (checks.FieldError, checks.FieldTypeError) as error:
+        if field_name != "stiffness_disorder":
+            raise
+        raise type(error)(f"stiffness_{error}") from None  # a Disorder calls itself disorder
 
 
 def describe(scene: Scene) -> str:

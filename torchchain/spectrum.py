@@ -48,7 +48,12 @@ def normal_modes(chain: Chain) -> NormalModes:
         )
     weight = chain.masses.rsqrt()
     symmetric = -chain.stiffness_matrix() * weight[..., :, None] * weight[..., None, :]
-    _, vectors = torch.linalg.eigh(symmetric)
+    try:
+        _, vectors = torch.linalg.eigh(symmetric)
+    except torch.linalg.LinAlgError as error:  # torch's own message names the member of the batch
+        raise DecompositionError(
+            f"masses and stiffnesses must leave the eigen-solver finite numbers, got: {error}"
+        ) from None
     return checked_modes(chain, vectors)
 
 
@@ -88,7 +93,8 @@ def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
             f"{residual[where].item():.1e} and orthogonality defect {orthogonality[where].item():.1e}"
             + checks.position(where)
         )
-    frequencies = squared.sqrt()
-    if chain.boundary == "periodic":
-        frequencies = torch.cat([torch.zeros_like(frequencies[..., :1]), frequencies[..., 1:]], dim=-1)
+    if chain.boundary == "periodic":  # no square root of the zero mode: it has no derivative there
+        frequencies = torch.cat([torch.zeros_like(squared[..., :1]), squared[..., 1:].sqrt()], dim=-1)
+    else:
+        frequencies = squared.sqrt()
     return NormalModes(frequencies, shapes)

@@ -62,7 +62,8 @@ class MomentTree:
         """Take in realizations first, first + 1, ...; values (realization, ...)."""
         self.count += len(values)
         level, start = 0, first
-        mean, squares = list(values.unbind()), [None] * len(values)
+        mean = list(values.unbind())
+        squares: list[Tensor | None] = [None] * len(mean)
         while mean:
             if start % 2:
                 left = self.waiting.pop((level, start - 1), None)

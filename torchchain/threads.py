@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
+from threadpoolctl import threadpool_limits
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -30,6 +31,13 @@ def single_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def single_blas_thread() -> Iterator[None]:
+    """:func:`single_thread` for NumPy and SciPy too; finding their libraries takes some milliseconds."""
+    with single_thread(), threadpool_limits(1, user_api="blas"):
+        yield
 
 
 def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:

@@ -46,17 +46,19 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
             bound = -_product(_transform(chain.force(displacement)), _transform(displacement))
         energy = (moving + bound) / 2
     else:
+        _require_ring(chain)
         elongation = chain.elongation(displacement)
         moved = _transform(masses.sqrt() * velocity)
         stretched = _transform(chain.align(chain.contact_stiffness, elongation).sqrt() * elongation)
-        if chain.boundary == "fixed":  # N + 1 contacts on N wavenumbers: a transform of their own length would not fit
-            raise checks.fail(
-                "boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary)
-            )
         energy = (_product(moved, moved) + _product(stretched, stretched)) / 2
     # k and -k are added: twice the value, except where they are one wavenumber.
     energy[..., 1 : (n + 1) // 2] *= 2
     return energy
+
+
+def _require_ring(chain: Chain) -> None:
+    if chain.boundary == "fixed":  # N + 1 contacts on N wavenumbers: a transform of their own length would not fit
+        raise checks.fail("boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary))
 
 
 def _transform(field: Tensor) -> Tensor:
@@ -109,18 +111,29 @@ def zero_wavenumber_share(chain: Chain, trajectory: Trajectory) -> Tensor:
 
 def _normalized(part: Tensor, energy: Tensor) -> Tensor:
     total = energy.sum(-1, keepdim=True)
-    checks.first_bad("total energy", "be positive to normalize", total[..., 0], ~(total[..., 0] > 0), "time")
+    _check_total(total[..., 0], "time")
     return part / total
 
 
+def _check_total(total: Tensor, axis: str) -> None:
+    bad = ~((total > 0) & total.isfinite())
+    checks.first_bad("total energy", "be positive and finite to normalize", total, bad, axis)
+
+
 def long_time_band_energy(
-    chain: Chain, state: State, n_bands: int = 32, normalize: bool = True, modes: NormalModes | None = None
+    chain: Chain,
+    state: State,
+    n_bands: int = 32,
+    normalize: bool = True,
+    modes: NormalModes | None = None,
+    definition: str = "site",
 ) -> Tensor:
     """Infinite-time average of the band energies, exactly, from the modes: no time stepping.
 
     A mode of energy E_j, half kinetic and half potential on average, contributes E_j Re[(M s_j)^ conj(s_j^)]
-    at each wavenumber (^: unitary DFT), since -K s_j = w_j^2 M s_j. Two modes of equal frequency, as the
-    ordered ring has, beat at no frequency and contribute their cross term.
+    at each wavenumber (^: unitary DFT), since -K s_j = w_j^2 M s_j, and for "bond" E_j / 2 times the squares of
+    (sqrt(b) s_j)^ and of (sqrt(kappa) times its elongations)^ / w_j. Two modes of equal frequency, as the ordered
+    ring has, beat at no frequency and contribute their cross term.
 
     Args:
         chain: linear contacts, undamped, an even number of particles.
@@ -128,35 +141,54 @@ def long_time_band_energy(
         n_bands: B.
         normalize: divide by the total energy.
         modes: the chain's NormalModes, where they are at hand.
+        definition: see :func:`wavenumber_energy`.
 
     Returns:
         (*batch, *any, band).
     """
     check_bands(chain.n_particles, n_bands)
+    checks.choice("definition", definition, DEFINITIONS)
     require_linear(chain, "a time average of simulated band energies")
     modes = normal_modes(chain) if modes is None else modes
     displacement, velocity = modal_amplitudes(chain, state, modes)
     frequency = chain.align(modes.frequencies, displacement)
     swing = frequency * displacement
     energy = (swing.square() + velocity.square()) / 2
-    shapes = modes.shapes.mT
-    moment, wave = _transform(chain.masses[..., None, :] * shapes), _transform(shapes)
-    bands = change_basis(energy, _band_weight(moment, wave, n_bands))
+    pairs = _mode_transforms(chain, modes, definition)
+    bands = change_basis(energy, _mean_weight(pairs, n_bands))
     # Cross terms of neighboring modes of one frequency; a chain has at most two modes of one frequency.
     gap = modes.frequencies.diff(dim=-1)
     equal = gap <= 64 * torch.finfo(gap.dtype).eps * modes.frequencies[..., -1:]
     if bool(equal.any()):
         cross = swing[..., 1:] * swing[..., :-1] + velocity[..., 1:] * velocity[..., :-1]
         cross = torch.where(chain.align(equal, cross), cross, torch.zeros_like(cross))
-        weight = _band_weight(moment[..., 1:, :], wave[..., :-1, :], n_bands) + _band_weight(
-            moment[..., :-1, :], wave[..., 1:, :], n_bands
-        )
+        upper = [(left[..., 1:, :], right[..., :-1, :]) for left, right in pairs]
+        lower = [(left[..., :-1, :], right[..., 1:, :]) for left, right in pairs]
+        weight = _mean_weight(upper, n_bands) + _mean_weight(lower, n_bands)
         bands = bands + change_basis(cross, weight) / 2
     if not normalize:
         return bands
     total = energy.sum(-1, keepdim=True)
-    checks.first_bad("total energy", "be positive to normalize", total[..., 0], ~(total[..., 0] > 0), "state")
+    _check_total(total[..., 0], "state")
     return bands / total
+
+
+def _mode_transforms(chain: Chain, modes: NormalModes, definition: str) -> list[tuple[Tensor, Tensor]]:
+    """Pairs of transforms (*batch, mode, wavenumber); the mean of their products is where a mode's energy is."""
+    shapes = modes.shapes.mT
+    if definition == "site":
+        return [(_transform(chain.masses[..., None, :] * shapes), _transform(shapes))]
+    _require_ring(chain)
+    moved = _transform(chain.masses.sqrt()[..., None, :] * shapes)
+    stretched = _transform(chain.contact_stiffness.sqrt()[..., None, :] * (shapes - shapes.roll(1, -1)))
+    still = modes.frequencies[..., None] == 0  # the zero mode has kinetic energy alone
+    stretched = torch.where(still, moved, stretched / modes.frequencies[..., None].masked_fill(still, 1))
+    return [(moved, moved), (stretched, stretched)]
+
+
+def _mean_weight(pairs: list[tuple[Tensor, Tensor]], n_bands: int) -> Tensor:
+    """Mean over the pairs of their products in bands, (*batch, mode, band)."""
+    return torch.stack([_band_weight(left, right, n_bands) for left, right in pairs]).mean(0)
 
 
 def _band_weight(moment: Tensor, wave: Tensor, n_bands: int) -> Tensor:

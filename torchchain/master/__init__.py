@@ -2,7 +2,18 @@
 
 from torchchain.master.calibration import calibrate
 from torchchain.master.equation import Calibration, MasterEquation
-from torchchain.master.model import Embedding, RateModel
+from torchchain.master.memory import MemoryModel
+from torchchain.master.model import Embedding, RateModel, TransferModel
 from torchchain.master.solvers import SOLVERS, IntegrationError
 
-__all__ = ["SOLVERS", "Calibration", "Embedding", "IntegrationError", "MasterEquation", "RateModel", "calibrate"]
+__all__ = [
+    "SOLVERS",
+    "Calibration",
+    "Embedding",
+    "IntegrationError",
+    "MasterEquation",
+    "MemoryModel",
+    "RateModel",
+    "TransferModel",
+    "calibrate",
+]

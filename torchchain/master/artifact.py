@@ -15,22 +15,33 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from torchchain import checks
-from torchchain.master.model import RateModel
+from torchchain.master.memory import MemoryModel
+from torchchain.master.model import RateModel, TransferModel
 from torchchain.scene import Scene
 
 FORMAT = "torchchain-master-equation"
 FORMAT_VERSION = 1
 CONVENTIONS = {
-    "axes": "rates[source, receiver], basis[source, receiver], damping[band]",
-    "equation": "e(t) = e(0) (basis exp(-damping t) + (1 - basis) exp((rates - damping) t)), row vectors",
+    "axes": "rates, basis [source, receiver]; damping [band]; amplitudes [function, source, receiver]",
+    "markov": "e(t) = e(0) (basis exp(-damping t) + (1 - basis) exp((rates - damping) t)), row vectors",
+    "memory": "e(t) = e(0) (basis + sum_m amplitudes[m] f_m(t)) exp(-damping t); f: exponentials, then cosine and sine of pairs",
     "bands": "n_bands equal bands of |k| in (0, pi]; tone n lies in band ceil(n / (n_particles / 2 / n_bands))",
     "units": "mean mass 1, linear contact stiffness 1; time: travel time of sound over one particle",
 }
 LARGEST_FILE = 2**28
-MODELS: dict[str, type[RateModel]] = {RateModel.kind: RateModel}
+MODELS: dict[str, type[TransferModel]] = {RateModel.kind: RateModel, MemoryModel.kind: MemoryModel}
+AXES: dict[str, dict[str, tuple[str, ...]]] = {
+    RateModel.kind: {"rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",)},
+    MemoryModel.kind: {
+        "rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",),
+        "amplitudes": ("function", "band", "band"), "decay": ("function",),
+        "pair_decay": ("function",), "pair_frequency": ("function",),
+    },
+}  # fmt: skip
+MOST_FUNCTIONS = 64
 
 
-def save(model: RateModel, record: Mapping[str, Any], path: str | Path) -> None:
+def save(model: TransferModel, record: Mapping[str, Any], path: str | Path) -> None:
     """Write model and record; the file appears whole or not at all."""
     import numpy
     import scipy
@@ -60,7 +71,7 @@ def save(model: RateModel, record: Mapping[str, Any], path: str | Path) -> None:
         },
     }
     metadata = {"torchchain": json.dumps(header, sort_keys=True, allow_nan=False)}
-    tensors = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in model.tensors().items()}
     path = Path(path)
     try:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
@@ -76,7 +87,7 @@ def save(model: RateModel, record: Mapping[str, Any], path: str | Path) -> None:
         raise checks.fail(f"file {path}", "be writable", f"{error.strerror or error}") from None
 
 
-def load(path: str | Path) -> tuple[RateModel, dict[str, Any]]:
+def load(path: str | Path) -> tuple[TransferModel, dict[str, Any]]:
     """Read and check a file written by :func:`save`."""
     path = Path(path)
     where = f"file {path}"
@@ -150,16 +161,22 @@ def _header(where: str, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _tensors(where: str, file: Any, header: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    expected = {"rates": 2, "basis": 2, "damping": 1}
+    expected = AXES[header["kind"]]
     names = set(file.keys())
     if names != set(expected):
         raise checks.fail(where, f"hold the tensors {', '.join(sorted(expected))}", checks.shown(sorted(names)[:4]))
     tensors = {}
-    for name, ndim in expected.items():
+    for name, axes in expected.items():
         part = file.get_slice(name)
         shape = tuple(part.get_shape())
-        if shape != (header["n_bands"],) * ndim:
-            raise checks.fail(where, f"hold {name} of shape {(header['n_bands'],) * ndim}", f"shape {shape}")
+        fits = len(shape) == len(axes) and all(
+            size == header["n_bands"] if axis == "band" else size <= MOST_FUNCTIONS
+            for size, axis in zip(shape, axes, strict=True)
+        )
+        if not fits:
+            raise checks.fail(
+                where, f"hold {name} of shape ({', '.join(axes)}) with {header['n_bands']} bands", f"shape {shape}"
+            )
         if part.get_dtype() not in ("F64", "F32"):
             raise checks.fail(where, f"hold {name} as 32 or 64 bit floating point", part.get_dtype())
         tensors[name] = file.get_tensor(name)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchchain import checks
 from torchchain.master import artifact
-from torchchain.master.model import RateModel
+from torchchain.master.model import TransferModel
 from torchchain.master.solvers import SOLVERS
 from torchchain.scene import Scene
 from torchchain.threads import single_thread
@@ -39,7 +39,7 @@ class MasterEquation(nn.Module):
         calibration: where it comes from.
     """
 
-    def __init__(self, model: RateModel, calibration: Calibration) -> None:
+    def __init__(self, model: TransferModel, calibration: Calibration) -> None:
         super().__init__()
         self.model = model
         self.calibration = calibration

@@ -25,7 +25,68 @@ class Embedding:
     readout: Tensor
 
 
-class RateModel(nn.Module):
+class TransferModel(nn.Module):
+    """What every model of the transfer between bands offers; energies are row vectors, e(t) = e(0) T(t)."""
+
+    kind: str
+    basis: Tensor
+    damping: Tensor
+
+    @property
+    def rates(self) -> Tensor:
+        """Q [source, receiver], per unit time."""
+        raise NotImplementedError
+
+    @property
+    def n_bands(self) -> int:
+        return len(self.basis)
+
+    @property
+    def n_parameters(self) -> int:
+        """Fitted numbers."""
+        raise NotImplementedError
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that makes the model, as its constructor takes it."""
+        raise NotImplementedError
+
+    def embedding(self) -> Embedding:
+        """The model as a linear differential equation with constant coefficients."""
+        raise NotImplementedError
+
+    def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
+        """e(t) by the matrix exponential, (*batch, time, band), from initial (*batch, band)."""
+        raise NotImplementedError
+
+    def transfer(self, times: Tensor) -> Tensor:
+        """T(t), (source, time, receiver): the propagation of a unit energy in each band."""
+        return self.propagate(torch.eye(self.n_bands, dtype=self.basis.dtype, device=self.basis.device), times)
+
+
+def checked_basis(basis: Tensor, rates: Tensor) -> Tensor:
+    """Pi [source, receiver] from itself or its diagonal, checked against the rates."""
+    n = len(rates)
+    if rates.ndim != 2 or rates.shape[1] != n or not n:
+        raise checks.fail("rates", "be a square matrix", f"shape {tuple(rates.shape)}")
+    basis = checks.real_tensor("basis", basis)
+    basis = torch.diag(basis) if basis.ndim == 1 else basis
+    if tuple(basis.shape) != (n, n):
+        raise checks.fail("basis", f"have shape {(n, n)} like the rates", f"shape {tuple(basis.shape)}")
+    total = basis.sum(-1)
+    checks.first_bad("basis", "have row sums of at most 1", total, total > 1 + 1e-6, "band")
+    return basis
+
+
+def checked_damping(damping: Tensor | None, rates: Tensor) -> Tensor:
+    """d [band], zero if None, checked against the rates."""
+    damping = torch.zeros_like(rates[0]) if damping is None else checks.real_tensor("damping", damping)
+    if tuple(damping.shape) != (len(rates),):
+        raise checks.fail("damping", f"have shape {(len(rates),)} like the rates", f"shape {tuple(damping.shape)}")
+    checks.first_bad("damping", "not be negative", damping, damping < 0, "band")
+    return damping
+
+
+class RateModel(TransferModel):
     """Transfer T(t) = Pi e^(-D t) + (I - Pi) exp((Q - D) t) between bands: e(t) = e(0) T(t), row vectors.
 
     Of the energy that starts in band s the share Pi[s, r] stays in band r for good (the basis energy e0 of Eq. 48);
@@ -46,33 +107,23 @@ class RateModel(nn.Module):
     def __init__(self, rates: Tensor, basis: Tensor, damping: Tensor | None = None) -> None:
         super().__init__()
         rates = checks.real_tensor("rates", rates)
-        if rates.ndim != 2 or rates.shape[0] != rates.shape[1] or not len(rates):
-            raise checks.fail("rates", "be a square matrix", f"shape {tuple(rates.shape)}")
-        n = len(rates)
-        basis = checks.real_tensor("basis", basis)
-        basis = torch.diag(basis) if basis.ndim == 1 else basis
-        damping = torch.zeros_like(rates[0]) if damping is None else checks.real_tensor("damping", damping)
-        for field, value, shape in (("basis", basis, (n, n)), ("damping", damping, (n,))):
-            if tuple(value.shape) != shape:
-                raise checks.fail(field, f"have shape {shape} like the rates", f"shape {tuple(value.shape)}")
-        checks.first_bad("damping", "not be negative", damping, damping < 0, "band")
-        total = basis.sum(-1)
-        checks.first_bad("basis", "have row sums of at most 1", total, total > 1 + 1e-6, "band")
-        self.rates = nn.Parameter(rates.detach().clone())
+        basis = checked_basis(basis, rates)
+        self._rates = nn.Parameter(rates.detach().clone())
         self.register_buffer("basis", basis.detach().clone())
-        self.register_buffer("damping", damping.detach().clone())
-        self.basis: Tensor
-        self.damping: Tensor
+        self.register_buffer("damping", checked_damping(damping, rates).detach().clone())
 
     @property
-    def n_bands(self) -> int:
-        return len(self.rates)
+    def rates(self) -> Tensor:
+        return self._rates
 
     @property
     def n_parameters(self) -> int:
-        """Free numbers in the model: all of Q, and the basis where it is a matrix of its own."""
+        """All of Q, and the basis where it is a matrix of its own."""
         diagonal = torch.diag(self.basis.diagonal())
         return self.n_bands**2 + (0 if torch.equal(diagonal, self.basis) else self.n_bands**2)
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {"rates": self.rates, "basis": self.basis, "damping": self.damping}
 
     def embedding(self) -> Embedding:
         """Free energy and basis energy side by side: (I - Pi, Pi) decaying by Q - D and -D."""
@@ -85,16 +136,11 @@ class RateModel(nn.Module):
         )
 
     def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
-        """e(t) by the matrix exponential, (*batch, time, band), from initial (*batch, band)."""
         resting = (initial @ self.basis)[..., None, :]
         if bool(self.damping.any()):
             resting = resting * torch.exp(-times[:, None] * self.damping)
         flow = self.rates - torch.diag(self.damping)
         return resting + flows(initial - initial @ self.basis, flow, times)
-
-    def transfer(self, times: Tensor) -> Tensor:
-        """T(t), (source, time, receiver): the propagation of a unit energy in each band."""
-        return self.propagate(torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device), times)
 
 
 def flows(start: Tensor, generator: Tensor, times: Tensor) -> Tensor:

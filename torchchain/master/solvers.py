@@ -12,7 +12,7 @@ import torchdiffeq
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.master.model import RateModel
+from torchchain.master.model import TransferModel
 
 ADAPTIVE = ("dopri8", "dopri5", "bosh3", "fehlberg2", "adaptive_heun")
 FIXED = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams", "fixed_adams")
@@ -51,7 +51,7 @@ class Solver:
     options: tuple[str, ...] = ()
 
 
-def expm(model: RateModel, initial: Tensor, times: Tensor) -> Tensor:
+def expm(model: TransferModel, initial: Tensor, times: Tensor) -> Tensor:
     """The matrix exponential: exact at every time."""
     return model.propagate(initial, times)
 
@@ -65,7 +65,7 @@ def _ode(method: str) -> Callable[..., Tensor]:
     adaptive, scipy = method in ADAPTIVE, method == "scipy_solver"
 
     def run(
-        model: RateModel,
+        model: TransferModel,
         initial: Tensor,
         times: Tensor,
         rtol: float = 1e-8,
