@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,7 +19,9 @@ from torchchain import checks, planning
 from torchchain.bands import band_of
 from torchchain.chain import Chain
 from torchchain.energy import energy_center, energy_width, particle_energy, total_energy
-from torchchain.evolvers import Trajectory, start
+from torchchain.evolvers import METHODS, Trajectory, fused, start
+from torchchain.evolvers.fused import energy_moments
+from torchchain.evolvers.linearity import elongation_estimate, warn_if_nonlinear
 from torchchain.excitation import Impulse, StandingWave, State
 from torchchain.scene import Scene
 from torchchain.spectrum import NormalModes, normal_modes
@@ -76,6 +78,9 @@ IN_TIME: dict[str, Observable] = {
 }
 
 
+FUSED = frozenset({"center", "total_energy", "width"})  # what the stencil's kernels measure without storing states
+
+
 class Stages:
     """Seconds spent in each named stage of a run; work on several threads counts its share of the time."""
 
@@ -127,6 +132,36 @@ class Chunk:
                 trajectory = advance(self.times[begin : begin + self.window])
             yield trajectory
 
+    def observe(self, names: Sequence[str]) -> dict[str, Tensor]:
+        """The named observables at all times, (realization, [tone,] *axes)."""
+        if not names:
+            return {}
+        if self.method == "chebyshev" and FUSED.issuperset(names):
+            with self.stages("evolution with observables"):
+                moments = energy_moments(
+                    self.chain, self.state, self.times, self.scene.energy_definition, **self.options
+                )
+            every = {"total_energy": moments.total, "center": moments.center, "width": moments.width}
+            return {name: every[name] for name in names}
+        if self.method == "chebyshev" and set(names) == {"band_energy"}:
+            with self.stages("evolution with observables"):
+                bands = fused.band_energy(
+                    self.chain,
+                    self.state,
+                    self.times,
+                    self.scene.n_bands,
+                    True,
+                    self.scene.energy_definition,
+                    **self.options,
+                )
+            return {"band_energy": bands}
+        parts: dict[str, list[Tensor]] = {name: [] for name in names}
+        for trajectory in self.trajectories():
+            with self.stages("observables"):
+                for name in names:
+                    parts[name].append(IN_TIME[name].of(self.scene, self.chain, trajectory))
+        return {name: torch.cat(values, dim=-len(IN_TIME[name].axes)) for name, values in parts.items()}
+
     def long_time(self) -> Tensor:
         """Infinite-time average of the normalized band energies, (realization, [tone,] band)."""
         modes = self.modes
@@ -171,8 +206,10 @@ def stream(
         plan = planning.plan(scene)
         method, options = plan.method, {**plan.options, **options}
     stages = stages or Stages()
-    workers = torch.get_num_threads() if torch.device(device).type == "cpu" else 1
+    on_cpu = torch.device(device).type == "cpu"
+    workers = torch.get_num_threads() if on_cpu and not METHODS[method].threaded else 1
     budget = checks.integer("memory_budget", memory_budget, 1) // workers
+    check_amplitude(scene)
     state_bytes = 8 * max(1, len(scene.tones)) * scene.n_particles * 10  # states, phases, transforms, products
     mode_bytes = 8 * scene.n_particles**2 * 8 if method == "modes" else 0
     realizations = 1 if scene.is_ordered else scene.realizations
@@ -197,6 +234,22 @@ def stream(
             stages.add(seconds)
             yield numbers[0], measured
             bar.update(len(numbers))
+
+
+def check_amplitude(scene: Scene) -> None:
+    """An error for linear contacts that the start would open, a :class:`LinearityWarning` for large amplitudes."""
+    if scene.contact != "linear":
+        return
+    chain = scene.chain([0])
+    state = scene.state(chain)
+    largest = float(elongation_estimate(chain, state).max())
+    if largest >= 1:
+        raise checks.fail(
+            "excitation",
+            "stretch no linear contact beyond the initial overlap 1 (use contact 'hertz')",
+            f"{largest:.3g}",
+        )
+    warn_if_nonlinear(chain, state, stacklevel=4)
 
 
 def realized_masses(moments: Moments) -> dict[str, float]:
@@ -231,12 +284,7 @@ def simulate(
     in_time = [name for name in scene.observables if name in IN_TIME]
 
     def measure(chunk: Chunk) -> dict[str, Tensor]:
-        parts: dict[str, list[Tensor]] = {name: [] for name in in_time}
-        for trajectory in chunk.trajectories() if in_time else ():
-            with chunk.stages("observables"):
-                for name in in_time:
-                    parts[name].append(IN_TIME[name].of(scene, chunk.chain, trajectory))
-        measured = {name: torch.cat(parts[name], dim=-len(IN_TIME[name].axes)) for name in in_time}
+        measured = chunk.observe(in_time)
         if "long_time_band_energy" in scene.observables:
             measured["long_time_band_energy"] = chunk.long_time()
         return measured
@@ -434,11 +482,7 @@ def band_transfer(
     masses = MomentTree()
 
     def measure(chunk: Chunk) -> dict[str, Tensor]:
-        parts = []
-        for trajectory in chunk.trajectories():
-            with chunk.stages("band energies"):
-                parts.append(IN_TIME["band_energy"].of(scene, chunk.chain, trajectory))
-        measured = {"band_energy": torch.cat(parts, dim=-2)}
+        measured = chunk.observe(["band_energy"])
         return measured | ({"long_time": chunk.long_time()} if long_time else {})
 
     for first, measured in stream(

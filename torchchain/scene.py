@@ -122,9 +122,8 @@ class Scene:
                 raise checks.fail("contact", f"be 'linear' for the observable {name}", repr(self.contact))
             if self.energy_definition == "bond" and self.boundary == "fixed":
                 raise checks.fail("boundary", f"be 'periodic' for the observable {name} by 'bond'", repr(self.boundary))
-        if self.contact == "hertz":
-            if self.energy_definition == "site":
-                put("energy_definition", "bond")  # the only one that a Hertz contact has
+        if self.contact == "hertz" and self.energy_definition == "site":
+            put("energy_definition", "bond")  # the only one that a Hertz contact has
         if self.damping > 0 and "long_time_band_energy" in self.observables:
             raise checks.fail("damping", "be zero for the observable long_time_band_energy", self.damping)
 

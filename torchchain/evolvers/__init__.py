@@ -6,11 +6,22 @@ from typing import Any
 
 from torchchain import checks
 from torchchain.chain import Chain
-from torchchain.evolvers import modes
+from torchchain.evolvers import chebyshev, damped, modes, ode, symplectic4, tridiagonal, verlet
 from torchchain.evolvers.method import Advance, Method, Trajectory
 from torchchain.excitation import State
 
-METHODS: dict[str, Method] = {entry.name: entry for entry in (modes.METHOD,)}
+METHODS: dict[str, Method] = {
+    entry.name: entry
+    for entry in (
+        modes.METHOD,
+        tridiagonal.METHOD,
+        chebyshev.METHOD,
+        verlet.METHOD,
+        symplectic4.METHOD,
+        damped.METHOD,
+        *ode.METHODS,
+    )
+}
 
 __all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "start"]
 

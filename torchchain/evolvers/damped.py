@@ -162,7 +162,7 @@ METHOD = Method(
     conserves="momentum; never gains energy, which is checked",
     stability="unconditional",
     cost="25 (2N)^3 once, (2N)^2 per output time, members alike; (2N)^2 complex memory",
-    cannot="Hertz contacts, chains of more than some hundred particles; gradients of chains with degenerate eigenvalues "
+    cannot="Hertz contacts, chains of more than some hundred particles; derivatives at degenerate eigenvalues "
     "(the ordered chain)",
     damped=True,
 )

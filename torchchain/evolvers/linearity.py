@@ -107,8 +107,8 @@ def warn_if_nonlinear(chain: Chain, state: State, limit: float = 0.05, stackleve
     opens = "contacts would open, " if largest >= 1 else ""
     warnings.warn(
         f"elongations of about {largest.item():.3g} of the initial overlap{checks.position(where)} (by energy at most "
-        f"{bound:.3g}) are too large for linear contacts: {opens}their force is off by {deviation:.0%}, more than "
-        f"{limit:.0%}; use a smaller amplitude, or contact='hertz'",
+        f"{bound:.3g}) are too large for linear contacts: {opens}their force is off by {100 * deviation:.2g} %, more "
+        f"than {100 * limit:.2g} %; use a smaller amplitude, or contact='hertz'",
         LinearityWarning,
         stacklevel=stacklevel,
     )

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -36,14 +36,16 @@ import numpy as np
 import torch
 from numba import njit
 
+from torchchain.evolvers.chebyshev import LEAP
+
 # What a march leaves behind at every output time; the fields are those whose transforms make the energy of a
 # wavenumber. Kinds 3 and up write as many fields as they name.
 STATES, SITE_MOMENTS, BOND_MOMENTS, UNIFORM_FIELDS, SITE_FIELDS, BOND_FIELDS = range(6)
 
 # A segment ends before z exceeds REACH or the outputs exceed LONGEST: the work per output, degree(z) stencils shared
 # by the segment plus two sums per output, is flat around this minimum (a sum costs a sixth of a stencil).
-REACH = 8.0
-LONGEST = 6
+REACH = 12.0
+LONGEST = 8
 # The mirrored form adds up rounding errors like a random walk's integral; a plain step now and then ends that.
 RESTART = 64
 # Dropped at the edges of the active window: energy norm below half an ulp of the whole chain's.
@@ -90,10 +92,10 @@ def _next_even(w, old, middle, new, left, n):
 
 
 @_kernel
-def _add_four(w, u, v, row0, row1, row2, row3, for_u, for_v, k, n):
+def _add_four(w, u, v, row0, row1, row2, row3, for_u, for_v, j, k, n):
     """Four terms of the sums for the displacement and velocity of one output."""
-    c0, c1, c2, c3 = for_u[k], for_u[k + 1], for_u[k + 2], for_u[k + 3]
-    d0, d1, d2, d3 = for_v[k], for_v[k + 1], for_v[k + 2], for_v[k + 3]
+    c0, c1, c2, c3 = for_u[j, k], for_u[j, k + 1], for_u[j, k + 2], for_u[j, k + 3]
+    d0, d1, d2, d3 = for_v[j, k], for_v[j, k + 1], for_v[j, k + 2], for_v[j, k + 3]
     p, q, a, b, c, d = _U(u), _U(v), _U(row0), _U(row1), _U(row2), _U(row3)
     for i in range(_U(n)):
         t0, t1, t2, t3 = w[a + i], w[b + i], w[c + i], w[d + i]
@@ -102,10 +104,10 @@ def _add_four(w, u, v, row0, row1, row2, row3, for_u, for_v, k, n):
 
 
 @_kernel
-def _first_four(w, u, v, row0, row1, row2, row3, for_u, for_v, keep_u, keep_v, n):
+def _first_four(w, u, v, row0, row1, row2, row3, for_u, for_v, j, keep_u, keep_v, n):
     """Terms 0 to 3; what the output's rows held is kept with the factors 0, 1 or -1."""
-    c0, c1, c2, c3 = for_u[0], for_u[1], for_u[2], for_u[3]
-    d0, d1, d2, d3 = for_v[0], for_v[1], for_v[2], for_v[3]
+    c0, c1, c2, c3 = for_u[j, 0], for_u[j, 1], for_u[j, 2], for_u[j, 3]
+    d0, d1, d2, d3 = for_v[j, 0], for_v[j, 1], for_v[j, 2], for_v[j, 3]
     p, q, a, b, c, d = _U(u), _U(v), _U(row0), _U(row1), _U(row2), _U(row3)
     for i in range(_U(n)):
         t0, t1, t2, t3 = w[a + i], w[b + i], w[c + i], w[d + i]
@@ -237,6 +239,12 @@ def _close(w, row, at):
 
 
 @_kernel
+def _clear(w, begin, end):
+    for i in range(_U(begin), _U(max(begin, end))):
+        w[i] = 0.0
+
+
+@_kernel
 def _expand(w, row, source, low, high, count, u, v, terms, for_u, for_v, keep_u, keep_v):
     """Adds sum_k for_u[j, k] T_k and sum_k for_v[j, k] T_k, T_k applied to the source, to the states u[j], v[j].
 
@@ -261,8 +269,8 @@ def _expand(w, row, source, low, high, count, u, v, terms, for_u, for_v, keep_u,
         if k > 0:  # the two rows before these held less, and beyond it they are zero
             for q in range(k - 2, k):
                 at = row.ring[q % _RING]
-                w[at + start - 1 : at + before_start] = 0.0
-                w[at + before_stop : at + stop + 1] = 0.0
+                _clear(w, at + start - 1, at + before_start)
+                _clear(w, at + before_stop, at + stop + 1)
                 if full:
                     _close(w, row, at)
         for q in range(max(k, 1), k + 4):
@@ -286,9 +294,9 @@ def _expand(w, row, source, low, high, count, u, v, terms, for_u, for_v, keep_u,
         t3 = start + row.ring[(k + 3) % _RING]
         for j in range(count):
             if k == 0:
-                _first_four(w, u[j] + start, v[j] + start, t0, t1, t2, t3, for_u[j], for_v[j], keep_u, keep_v, size)
+                _first_four(w, u[j] + start, v[j] + start, t0, t1, t2, t3, for_u, for_v, j, keep_u, keep_v, size)
             elif k < terms[j]:
-                _add_four(w, u[j] + start, v[j] + start, t0, t1, t2, t3, for_u[j], for_v[j], k, size)
+                _add_four(w, u[j] + start, v[j] + start, t0, t1, t2, t3, for_u, for_v, j, k, size)
     return start, stop
 
 
@@ -315,15 +323,18 @@ def _trim(w, row, u, v, used, stiff, limit, low, high):
         stop -= 1
     for j in range(u.size):
         for at in (u[j], v[j]):
-            w[at + low : at + start] = 0.0
-            w[at + stop : at + high] = 0.0
+            _clear(w, at + low, at + start)
+            _clear(w, at + stop, at + high)
     return start, stop
 
 
 @_kernel
 def _silent(w, at, low, high):
     """Whether a row is zero."""
-    return not np.any(w[at + low : at + high])
+    for i in range(_U(at + low), _U(at + high)):  # noqa: SIM110 (Numba compiles no generators inside all)
+        if w[i] != 0.0:
+            return False
+    return True
 
 
 @_kernel
@@ -391,9 +402,10 @@ def _record_fields(w, row, u, v, kind, out, r, i):
             out[0, r, i, p] = math.sqrt(w[row.mass + p]) * w[v + p]
             out[1, r, i, p] = math.sqrt(w[row.contact + p]) * (w[u + p] - w[u + p - 1])
     else:
-        out[0, r, i] = w[v : v + n]
-        out[1, r, i] = w[row.mass : row.mass + n] * w[v : v + n]
         out[2, r, i] = w[u : u + n]
+        for p in range(n):
+            out[0, r, i, p] = w[v + p]
+            out[1, r, i, p] = w[row.mass + p] * w[v + p]
         if kind == SITE_FIELDS:
             for p in range(n):
                 x = w[u + p]
@@ -464,7 +476,7 @@ def march(
             w[row.contact + n] = contacts[realization, n]
             row = Row(n, periodic, even, row.mass, row.contact, row.left, row.right, ring)
             offsets[:] = -1.0
-        w[ring[0] - _PAD :] = 0.0
+        _clear(w, ring[0] - _PAD, w.size)
         for j in range(LONGEST + 1):
             u[j] = (4 + _RING + 2 * j) * stride + _PAD
             v[j] = u[j] + stride
@@ -495,6 +507,7 @@ def march(
                 low, high = _trim(w, row, u, v, history + 1, stiff, limit, start, stop)
                 anchor, since, here = when[0], 0, 0
             count = 0
+            leaps = math.ceil(frequency * (times[i] - anchor) / LEAP)
             if since == 0 and times[i] == anchor:
                 count = 1
             else:
@@ -507,10 +520,11 @@ def march(
                     slack = _SLACK * times[i + count] if mirrored else 0.0
                     known = known and abs(ahead - offsets[count]) <= slack
                     count += 1
-                mirror = mirrored and count <= history and age < RESTART
+                known = known and leaps == 1
+                mirror = mirrored and leaps == 1 and count <= history and age < RESTART
                 for j in range(count):
                     if not known:
-                        offsets[j] = times[i + j] - anchor
+                        offsets[j] = (times[i + j] - anchor) / leaps
                         terms[j] = _coefficients(
                             frequency, offsets[j], tolerance, bessel, cosine[j], drift[j], slope[j]
                         )
@@ -539,9 +553,11 @@ def march(
                             w, row, u[0], low, high, count, u[1:], v[1:], terms, cosine, slope, keep, keep
                         )
                 for j in range(count):
-                    when[j + 1] = anchor + offsets[j] if mirrored else times[i + j]
+                    when[j + 1] = anchor + offsets[j] if mirrored or leaps > 1 else times[i + j]
                 since += count
                 here = count
+                if leaps > 1:
+                    continue
             for j in range(count):
                 at = j + 1 if since > 0 else 0
                 if periodic:
@@ -557,48 +573,48 @@ def march(
         clock[r, 0], clock[r, 1], clock[r, 2] = anchor, since, times[steps - 1]
 
 
-@_kernel
-def bin_spectra(begin, end, spectra, kind, strain, tones_per_band, bands, totals):
-    """Energies of wavenumbers (Eq. 43) summed into bands (Eq. 44) for states begin to end - 1.
+@_summing_kernel
+def bin_spectra(spectra, kind, strain, bands):
+    """Energies of wavenumbers (Eq. 43) summed into bands (Eq. 44).
 
     Args:
-        begin, end: states.
-        spectra: transforms (field, state, wavenumber) of the fields that :func:`march` leaves, without a factor.
+        spectra: transforms of the fields that :func:`march` leaves, without a factor, (field, state, 2 (N/2 + 1)): the
+            real and the imaginary part of each wavenumber in turn.
         kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS.
         strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, (wavenumber,).
-        tones_per_band: wavenumbers in a band.
-        bands: (state, band), written.
-        totals: energy over all wavenumbers, (state,), written.
+        bands: (state, band + 1), written; the energy over all wavenumbers, k = 0 among them, comes last.
     """
-    count = spectra.shape[2]
-    n = 2 * (count - 1)
-    energy = np.empty(count)
-    for s in range(begin, end):
-        a, b, c = spectra[0, s], spectra[1, s], spectra[min(2, spectra.shape[0] - 1), s]
+    size = spectra.shape[2]
+    n_bands = bands.shape[1] - 1
+    width = (size - 2) // n_bands
+    # 1/2 for the energy and 1/N for the unitary transform; k and -k are two, except where they are one.
+    scale = 1.0 / (size - 2)
+    energy = np.empty(size)
+    strains = np.repeat(strain, 2)
+    for s in range(spectra.shape[1]):
+        a, b = spectra[0, s], spectra[1, s]
         if kind == UNIFORM_FIELDS:
-            for k in range(count):
-                bound = c[k].real * c[k].real + c[k].imag * c[k].imag
-                energy[k] = a[k].real * b[k].real + a[k].imag * b[k].imag + strain[k] * bound
+            c = spectra[2, s]
+            for k in range(size):
+                energy[k] = a[k] * b[k] + strains[k] * c[k] * c[k]
         elif kind == SITE_FIELDS:
-            d = spectra[3, s]
-            for k in range(count):
-                moving = a[k].real * b[k].real + a[k].imag * b[k].imag
-                energy[k] = moving + c[k].real * d[k].real + c[k].imag * d[k].imag
+            c, d = spectra[2, s], spectra[3, s]
+            for k in range(size):
+                energy[k] = a[k] * b[k] + c[k] * d[k]
         else:
-            for k in range(count):
-                moving = a[k].real * a[k].real + a[k].imag * a[k].imag
-                energy[k] = moving + b[k].real * b[k].real + b[k].imag * b[k].imag
-        # Half for the energy, 1/N for the unitary transform; k and -k are two, except where they are one.
+            for k in range(size):
+                energy[k] = a[k] * a[k] + b[k] * b[k]
         energy[0] *= 0.5
-        energy[count - 1] *= 0.5
+        energy[size - 2] *= 0.5
         total = energy[0]
-        for band in range(bands.shape[1]):
+        for band in range(n_bands):
             part = 0.0
-            for k in range(1 + band * tones_per_band, 1 + (band + 1) * tones_per_band):
-                part += energy[k]
-            bands[s, band] = part / n
+            start = _U(2 + band * width)
+            for k in range(_U(width)):
+                part += energy[start + k]
+            bands[s, band] = part * scale
             total += part
-        totals[s] = total / n
+        bands[s, n_bands] = total * scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -628,16 +644,28 @@ class Rows:
     def count(self) -> int:
         return len(self.displacement)
 
-    def part(self, begin: int, end: int) -> Rows:
-        """The rows of realizations begin to end - 1."""
-        rows = slice(begin * self.starts, end * self.starts)
+    def chunks(self, size: int) -> Iterator[tuple[int, int]]:
+        """Ranges of at most ``size`` rows, each of whole realizations or within one, for :meth:`select`."""
+        if size >= self.starts:
+            size -= size % self.starts
+            for begin in range(0, self.count, size):
+                yield begin, min(begin + size, self.count)
+        else:
+            for first in range(0, self.count, self.starts):
+                for begin in range(first, first + self.starts, size):
+                    yield begin, min(begin + size, first + self.starts)
+
+    def select(self, begin: int, end: int) -> Rows:
+        """Rows begin to end - 1."""
+        chains = slice(begin // self.starts, (end - 1) // self.starts + 1)
         return replace(
             self,
-            masses=self.masses[begin:end],
-            contacts=self.contacts[begin:end],
-            frequencies=self.frequencies[begin:end],
-            displacement=self.displacement[rows],
-            velocity=self.velocity[rows],
+            masses=self.masses[chains],
+            contacts=self.contacts[chains],
+            frequencies=self.frequencies[chains],
+            displacement=self.displacement[begin:end],
+            velocity=self.velocity[begin:end],
+            starts=min(self.starts, end - begin),
         )
 
 

@@ -3,6 +3,9 @@
 A drift moves the particles at constant velocity, a kick changes the velocities by the contact forces at rest; each is
 solved exactly, so any sequence of them is symplectic. Two implementations are tested to be equal: plain torch, which
 is differentiable and runs on any device, and a numba loop for CPU tensors that need no gradient.
+
+``openings`` counts the different contacts found open at any evaluation of the forces (in ``verlet``, every step) or at
+any output, up to each time. An open Hertz contact does not damp.
 """
 
 from __future__ import annotations
@@ -222,7 +225,9 @@ def _rows(chain: Chain, state: State, composition: Composition, step: float) -> 
     n, lead = chain.n_particles, state.displacement.shape[:-1]
     with torch.no_grad():
         dtype = chain.masses.dtype
-        displacement, velocity = (x.reshape(-1, n).clone() for x in (state.displacement, state.velocity))
+        displacement, velocity = (
+            x.reshape(-1, n).clone(memory_format=torch.contiguous_format) for x in (state.displacement, state.velocity)
+        )
         peak = torch.full((len(displacement), n + 1), -math.inf, dtype=dtype)
         lost = torch.zeros(len(displacement), dtype=dtype)
         weight = (1 / chain.masses).reshape(-1, n).contiguous()

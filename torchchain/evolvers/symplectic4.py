@@ -35,7 +35,7 @@ METHOD = Method(
     stability="w_max step < 2.98944, where the trace of its step on an oscillator first leaves [-2, 2]; "
     "Hertz contacts: w_max grows with the fourth root of the overlap, and the energy is watched",
     cost="four forces per step, N each; no memory beyond the states",
-    cannot="damping (its negative substeps would amplify); Hertz contacts lower the order when contacts open",
+    cannot="damping (its negative substeps would amplify); order 4 once Hertz contacts open (it is about 2.5 then)",
     contacts=("linear", "hertz"),
     options={"step": "largest step; outputs are reached by equal steps of at most that (default 0.4 / w_max)"},
 )

@@ -4,17 +4,21 @@ Imported on first use, because numba takes a while to load. Fields are padded wi
 wall's (at rest) or the neighbor's across the seam, so that contact c joins entries c and c + 1 whatever the boundary.
 """
 
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 _compile = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @_compile
-def _wrap(field, periodic):  # type: ignore[no-untyped-def]
+def _wrap(field, periodic):
     n = field.shape[0] - 2
     if periodic:
         field[0] = field[n]
@@ -22,14 +26,14 @@ def _wrap(field, periodic):  # type: ignore[no-untyped-def]
 
 
 @_compile
-def _drift(displacement, velocity, duration, periodic):  # type: ignore[no-untyped-def]
+def _drift(displacement, velocity, duration, periodic):
     for i in range(displacement.shape[0]):
         displacement[i] += duration * velocity[i]
     _wrap(displacement, periodic)
 
 
 @_compile
-def _kick(displacement, velocity, duration, weight, stiffness, hertz, tension, peak, periodic):  # type: ignore[no-untyped-def]
+def _kick(displacement, velocity, duration, weight, stiffness, hertz, tension, peak, periodic):
     n = weight.shape[0]
     if hertz:
         one = weight.dtype.type(1)
@@ -57,7 +61,7 @@ def _kick(displacement, velocity, duration, weight, stiffness, hertz, tension, p
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _damp(displacement, velocity, duration, weight, damping, hertz, active, force, middle, periodic):  # type: ignore[no-untyped-def]
+def _damp(displacement, velocity, duration, weight, damping, hertz, active, force, middle, periodic):
     """Contact damping over the duration by the explicit midpoint rule; returns the kinetic energy it takes."""
     n = weight.shape[0]
     half = weight.dtype.type(0.5)
@@ -87,7 +91,7 @@ def _damp(displacement, velocity, duration, weight, damping, hertz, active, forc
 
 
 @_compile
-def _advance_row(  # type: ignore[no-untyped-def]
+def _advance_row(
     displacement, velocity, peak, lost, weight, stiffness, damping, periodic, hertz, damped,
     opening, middle, closing, substeps, steps, displacements, velocities, losses, openings,
 ):  # fmt: skip
@@ -100,14 +104,13 @@ def _advance_row(  # type: ignore[no-untyped-def]
     _wrap(v, periodic)
     tension = np.zeros(n + 1, weight.dtype)
     active = np.zeros(n + 1, weight.dtype)
-    middle_velocity = np.zeros(n + 2, weight.dtype)
+    relaxed = np.zeros(n + 2, weight.dtype)
     half = weight.dtype.type(0.5)
     for t in range(substeps.shape[0]):
         h = steps[t]
         if substeps[t] > 0:
             if damped:
-                lost += _damp(u, v, half * h, weight, damping, hertz, active, tension, middle_velocity, periodic)
-            drift, kick = opening[0], opening[1]
+                lost += _damp(u, v, half * h, weight, damping, hertz, active, tension, relaxed, periodic)
             for step in range(substeps[t]):
                 last = step + 1 == substeps[t]
                 # Without damping between them, the end of a step and the start of the next are one drift and one kick.
@@ -127,18 +130,8 @@ def _advance_row(  # type: ignore[no-untyped-def]
                 if kick != 0:
                     _kick(u, v, kick * h, weight, stiffness, hertz, tension, peak, periodic)
                 if damped:
-                    lost += _damp(
-                        u,
-                        v,
-                        half * h if last else h,
-                        weight,
-                        damping,
-                        hertz,
-                        active,
-                        tension,
-                        middle_velocity,
-                        periodic,
-                    )
+                    duration = half * h if last else h
+                    lost += _damp(u, v, duration, weight, damping, hertz, active, tension, relaxed, periodic)
         displacements[t] = u[1:-1]
         velocities[t] = v[1:-1]
         losses[t] = lost
@@ -153,13 +146,13 @@ def _advance_row(  # type: ignore[no-untyped-def]
     return lost
 
 
-@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _advance_rows(  # type: ignore[no-untyped-def]
-    displacement, velocity, peak, lost, weight, stiffness, damping, periodic, hertz, damped,
+@_compile
+def _advance_rows(
+    begin, end, displacement, velocity, peak, lost, weight, stiffness, damping, periodic, hertz, damped,
     opening, middle, closing, substeps, steps, displacements, velocities, losses, openings,
 ):  # fmt: skip
     members = displacement.shape[0] // weight.shape[0]
-    for row in numba.prange(displacement.shape[0]):
+    for row in range(begin, end):
         chain = row // members
         lost[row] = _advance_row(
             displacement[row], velocity[row], peak[row], lost[row], weight[chain], stiffness[chain], damping[chain],
@@ -168,20 +161,23 @@ def _advance_rows(  # type: ignore[no-untyped-def]
         )  # fmt: skip
 
 
-def advance_rows(threads: int, *arguments: NDArray | bool) -> None:
-    """Advance every row in place and fill its outputs, on at most ``threads`` threads.
+def advance_rows(threads: int, *arguments: Any) -> None:
+    """Advance every row in place and fill its outputs.
 
     Args:
-        threads: an upper bound; numba's own limit holds as well.
+        threads: how many share the rows.
         arguments: displacement and velocity (row, particle), peak elongation (row, contact + 1) and energy lost
             (row,), all updated; weight 1/m (chain, particle), stiffness and damping (chain, contact + 1), a periodic
             chain's contact 0 being repeated at the end; the flags periodic, hertz and damped; the composition's
             opening (2,), middle (stage, 2) and closing (2,) drifts and kicks; substeps and their length (time,);
             the outputs displacement and velocity (row, time, particle), energy lost and openings (row, time).
     """
-    before = numba.get_num_threads()
-    numba.set_num_threads(max(1, min(threads, before)))
-    try:
-        _advance_rows(*arguments)
-    finally:
-        numba.set_num_threads(before)
+    rows = len(arguments[0])
+    threads = min(threads, rows)
+    if threads <= 1:
+        _advance_rows(0, rows, *arguments)
+        return
+    edges = np.linspace(0, rows, threads + 1).astype(int).tolist()
+    # Python's own threads, as the loop holds no lock: numba's may not be called from several of them at once.
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda begin, end: _advance_rows(begin, end, *arguments), edges[:-1], edges[1:]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.linalg import eigh_tridiagonal
 from torch import Tensor
 
 from torchchain import checks
@@ -17,6 +16,8 @@ from torchchain.spectrum import checked_modes
 
 def vectors(chain: Chain) -> Tensor:
     """Orthonormal eigenvectors of the tridiagonal M^(-1/2) K M^(-1/2), frequencies ascending, (*batch, particle, mode)."""
+    from scipy.linalg import eigh_tridiagonal  # takes a while to load
+
     stiffness, weight = chain.contact_stiffness, chain.masses.rsqrt()
     diagonal = (stiffness[..., :-1] + stiffness[..., 1:]) / chain.masses
     beside = -stiffness[..., 1:-1] * weight[..., 1:] * weight[..., :-1]
@@ -30,7 +31,7 @@ def vectors(chain: Chain) -> Tensor:
 def start(chain: Chain, state: State) -> Advance:
     """See the registry entry below."""
     for field in ("masses", "stiffness"):
-        if torch.as_tensor(getattr(chain, field)).requires_grad:
+        if torch.is_grad_enabled() and torch.as_tensor(getattr(chain, field)).requires_grad:
             raise checks.fail(
                 field, "not require a gradient for method 'tridiagonal' (use 'modes')", "requires_grad=True"
             )

@@ -25,7 +25,7 @@ METHOD = Method(
     stability="w_max step < 2, which also keeps linear damped chains from growing if M^-1 D step < 2; "
     "Hertz contacts: w_max grows with the fourth root of the overlap, and the energy is watched",
     cost="one force per step, N each; no memory beyond the states",
-    cannot="exactness: the phase error is the price; Hertz contacts lower the order when contacts open",
+    cannot="keep phases: their error grows with time; order 2 once damped Hertz contacts open (it is 1 then)",
     contacts=("linear", "hertz"),
     damped=True,
     options={"step": "largest step; outputs are reached by equal steps of at most that (default 0.1 / w_max)"},

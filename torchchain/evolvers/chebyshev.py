@@ -1,0 +1,285 @@
+"""Chebyshev propagation: exact to rounding, by nothing but the chain's own stencil (Eqs. 13, 20).
+
+With A = -M^-1 K, a squared frequency W^2 that no mode exceeds, x = 1 - 2 A / W^2 and z = W t,
+
+    cos(sqrt(A) t) = J_0(z) + 2 sum_k J_2k(z) T_k(x),
+
+(Tal-Ezer, SIAM J. Numer. Anal. 23, 11, 1986; Kosloff et al., Geophys. Prospecting 37, 383, 1989): a polynomial in A
+of a degree that is z / 2 and a few more. A start (u, v) needs it, its time integral and its time derivative, which
+are sums over the same T_k; :func:`coefficients` has theirs. No matrix is formed.
+
+The times are crossed in *segments*; see :data:`LEAP`. The sums leave out coefficients that add up to no more than
+accuracy / 1024, or half an ulp where that is larger, in each segment. As |T_k(x)| <= 1 on the spectrum, what is left
+out is at most that share of the state's size, sqrt(W^2 |u|^2 + |v|^2) in the norm of Eq. 18, and since the motion
+conserves energy these shares add up at worst: the truncation stays below ``accuracy`` for 1024 segments. Rounding
+errors come on top; they are 1e-13 after hundreds of units of time.
+
+This file holds the plain torch implementation: the reference, for any device and for gradients. On the CPU the Numba
+kernels of :mod:`stencil` do the same.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy import special
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import Chain
+from torchchain.evolvers.method import Advance, Method, Trajectory
+from torchchain.excitation import State
+
+if TYPE_CHECKING:
+    from torchchain.evolvers.stencil import Rows
+
+# A stretch of time with z beyond this is crossed in equal leaps. Longer ones save little, as the degree is z / 2 and a
+# few, while rounding errors of the recursion grow with its degree.
+LEAP = 256.0
+SEGMENTS = 1024
+ROUNDING = 2.0**-53
+
+
+def start(
+    chain: Chain,
+    state: State,
+    accuracy: float = 1e-12,
+    bound: float | Tensor | None = None,
+    compiled: bool | None = None,
+) -> Advance:
+    """See the registry entry below.
+
+    Raises:
+        FieldError: for an option out of range; for a ``bound`` that a squared frequency of the chain exceeds.
+    """
+    accuracy = checks.number("accuracy", accuracy, above=0, at_most=0.1)
+    tolerance = max(accuracy / SEGMENTS, ROUNDING)
+    possible = _compilable(chain, state)
+    if compiled is None:
+        compiled = possible
+    elif not isinstance(compiled, bool):
+        raise checks.FieldTypeError(f"compiled must be True, False or None, got {checks.shown(compiled)}")
+    elif compiled and not possible:
+        raise checks.fail(
+            "compiled",
+            "be False for tensors off the CPU, that require gradients, or that are neither float32 nor float64",
+            compiled,
+        )
+    frequency = highest_frequency(chain, bound)
+    return (
+        CompiledAdvance(chain, state, frequency, tolerance) if compiled else _plain(chain, state, frequency, tolerance)
+    )
+
+
+def _compilable(chain: Chain, state: State) -> bool:
+    """Whether the Numba kernels can treat these tensors."""
+    tensors = (chain.masses, chain.contact_stiffness, state.displacement, state.velocity)
+    return all(
+        x.device.type == "cpu"
+        and x.dtype in (torch.float32, torch.float64)
+        and not (x.requires_grad and torch.is_grad_enabled())
+        for x in tensors
+    )
+
+
+def highest_frequency(chain: Chain, bound: float | Tensor | None = None) -> Tensor:
+    """W, at least the highest frequency of each chain, (*batch,), float64.
+
+    Args:
+        chain: linear contacts.
+        bound: of the squared frequency, a number or (*batch,); by default the chain's own, which is rigorous.
+
+    Raises:
+        FieldError: if a squared frequency exceeds the ``bound``.
+    """
+    with torch.no_grad():
+        if bound is None:
+            squared = chain.squared_frequency_bound(sweeps=8).to(torch.float64)
+        else:
+            squared = checks.real_tensor("bound", bound).to(chain.masses.device, torch.float64)
+            checks.first_bad("bound", "be positive", squared, squared <= 0)
+            if squared.shape not in (torch.Size(), chain.batch_shape):
+                raise checks.fail(
+                    "bound", f"be a number or have shape {tuple(chain.batch_shape)}", f"shape {tuple(squared.shape)}"
+                )
+            squared = squared.expand(chain.batch_shape)
+            checks.first_bad(
+                "bound",
+                "not lie below the largest squared frequency (chain.squared_frequency_bound() never does)",
+                squared,
+                _exceeded(chain, squared),
+                "chain",
+            )
+        # Rounded up to 24 bits, so that W^2 and most W t are exact and the operator and its time fit to the last bit.
+        mantissa, exponent = torch.frexp(squared.sqrt())
+        return torch.ldexp((mantissa * 2**24).ceil() / 2**24, exponent)
+
+
+def _exceeded(chain: Chain, squared: Tensor) -> Tensor:
+    """Whether a squared frequency of each chain exceeds the bound by more than rounding, (*batch,).
+
+    No eigenvalue of A exceeds the bound exactly where bound M + K is positive semidefinite, and by Sylvester's law of
+    inertia that is where elimination finds no negative pivot: a test that no single high mode escapes.
+    """
+    n = chain.n_particles
+    masses = chain.masses.double().reshape(-1, n).cpu().numpy().T
+    stiffness = chain.contact_stiffness.double().reshape(-1, chain.n_contacts).cpu().numpy().T
+    right = np.roll(stiffness, -1, axis=0) if chain.boundary == "periodic" else stiffness[1:]
+    diagonal = squared.reshape(-1).cpu().numpy() * (1 + 1e-12) * masses - stiffness[:n] - right
+    # On a ring the last particle is coupled to the first, too, and by elimination to each of the others in turn.
+    corner = stiffness[0] if chain.boundary == "periodic" else np.zeros_like(stiffness[0])
+    exceeded = np.zeros(corner.shape, bool)
+    last = diagonal[-1]
+    pivot = diagonal[0]
+    for p in range(n - 1):
+        exceeded |= pivot <= 0
+        pivot = np.where(exceeded, 1.0, pivot)
+        coupling = right[p]
+        if p == n - 2:
+            last = last - (corner + coupling) ** 2 / pivot
+        else:
+            last = last - corner**2 / pivot
+            corner = -corner * coupling / pivot
+            pivot = diagonal[p + 1] - coupling**2 / pivot
+    exceeded |= last < 0
+    return torch.from_numpy(exceeded).reshape(squared.shape).to(squared.device)
+
+
+def coefficients(frequency: np.ndarray, time: np.ndarray, tolerance: float) -> np.ndarray:
+    """Coefficients of T_k in the cosine, its time integral and its time derivative, (3, term, realization).
+
+    They are 2 J_2k(z), (4 / W) (J_2k+1 + J_2k+3 + ...)(z) and W (J_2k-1 - J_2k+1)(z) with z = W t, half of that for
+    k = 0. Each realization has as many terms as its z needs and zeros beyond: the sums of all |cosine|, W |integral|
+    and |derivative| / W left out are within the tolerance. The first term is set so that a translation of the whole
+    chain, on which every T_k is 1, moves exactly: the sums over k are 1, t and 0.
+
+    Args:
+        frequency: W, (realization,).
+        time: t, not negative, (realization,).
+        tolerance: see above.
+    """
+    z = frequency * time
+    # By Kapteyn's inequality (DLMF, Section 10.14) |J| < 1e-25 from here on. Each realization has its own end, so that it gets
+    # the same sums in any batch.
+    top = 2 * (0.5 * z + 8.0 * np.cbrt(z) + 10.0).astype(int)
+    order = np.arange(top.max() + 2)[:, None]
+    bessel = np.where(order <= top, special.jv(order, z), 0.0)
+    even, odd = bessel[0::2], bessel[1::2]
+    before = np.concatenate([-odd[:1], odd[:-1]])  # J_-1 = -J_1
+    odd_sums = np.cumsum(odd[::-1], axis=0)[::-1]
+    table = np.stack([2 * even, 4 * odd_sums / frequency, frequency * (before - odd)])
+    table[:, 0] /= 2
+    sizes = np.abs(table) * np.stack([np.ones_like(z), frequency, 1 / frequency])[:, None]
+    left_out = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1].max(0)
+    table = np.where(left_out > tolerance, table, 0.0)
+    table[:, 0] = np.stack([np.ones_like(z), time, np.zeros_like(z)]) - table[:, 1:].sum(1)
+    return table[:, : (left_out > tolerance).sum(0).max()]
+
+
+def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> Advance:
+    """The expansion in plain torch, from each output time to the next."""
+    axis = len(chain.batch_shape)
+    pair = torch.stack([state.displacement, state.velocity], dim=axis)
+    ahead = (None,) * (pair.ndim - axis - 1)  # axes of a state behind the batch
+    frequencies = frequency.reshape(-1).cpu().numpy()
+    weight = chain.align((4 / frequency.square()).to(chain.masses)[..., None] / chain.masses, pair)
+    now = 0.0
+
+    def step(pair: Tensor, time: np.ndarray) -> Tensor:
+        table = torch.from_numpy(coefficients(frequencies, time, tolerance)).to(pair)
+        table = table.reshape(*table.shape[:2], *chain.batch_shape)[(..., *ahead)]
+        older, old = pair, pair + weight / 2 * chain.force(pair)
+        total: list[Tensor] = []
+        for k in range(table.shape[1]):
+            if k > 1:
+                older, old = old, 2 * old - older + weight * chain.force(old)
+            displacement, velocity = (pair if k == 0 else old).unbind(axis)
+            cosine, integral, derivative = table[:, k]
+            terms = [
+                cosine * displacement + integral * velocity,
+                cosine * velocity + derivative * displacement,
+            ]
+            total = [a + b for a, b in zip(total, terms, strict=True)] if total else terms
+        return torch.stack(total, dim=axis)
+
+    def advance(times: Tensor) -> Trajectory:
+        nonlocal pair, now
+        outputs = []
+        for t in _later(times, now).tolist():
+            # Each realization takes the leaps it needs by itself, and then rests.
+            leaps = np.ceil(frequencies * (t - now) / LEAP)
+            for leap in range(int(leaps.max())):
+                pair = step(pair, np.where(leap < leaps, (t - now) / leaps, 0.0))
+            now = t
+            outputs.append(pair)
+        displacement, velocity = torch.stack(outputs, dim=-2).unbind(axis)
+        return Trajectory(times, displacement, velocity)
+
+    return advance
+
+
+def _later(times: Tensor, now: float) -> Tensor:
+    """The times as float64 on the CPU, none before those of the last window."""
+    if bool(times[0] < now):
+        raise checks.fail("times", f"not go back behind the last window's end {now:g}", times[0].item())
+    return times.detach().to("cpu", torch.float64)
+
+
+class CompiledAdvance:
+    """The expansion by the kernels of :mod:`stencil`, in float64 whatever the dtype of the state."""
+
+    def __init__(self, chain: Chain, state: State, frequency: Tensor, tolerance: float) -> None:
+        from torchchain.evolvers import stencil  # imports Numba
+
+        n = chain.n_particles
+
+        def plain(x: Tensor) -> np.ndarray:
+            return x.detach().double().reshape(-1, x.shape[-1]).contiguous().numpy()
+
+        contacts = chain.contact_stiffness
+        if chain.boundary == "periodic":
+            contacts = torch.cat([contacts, contacts[..., :1]], dim=-1)
+        masses, displacement = plain(chain.masses), plain(state.displacement)
+        self.rows: Rows = stencil.Rows(
+            masses=masses,
+            contacts=plain(contacts),
+            frequencies=frequency.reshape(-1).numpy(),
+            displacement=displacement,
+            velocity=plain(state.velocity),
+            starts=len(displacement) // len(masses),
+            periodic=chain.boundary == "periodic",
+            tolerance=tolerance,
+        )
+        self._march = stencil.March(self.rows)
+        self._shape, self._n, self._dtype = state.displacement.shape[:-1], n, state.displacement.dtype
+        self._now = 0.0
+
+    def __call__(self, times: Tensor) -> Trajectory:
+        from torchchain.evolvers import stencil
+
+        later = _later(times, self._now)
+        out = torch.empty((2, self.rows.count, len(later), self._n), dtype=self._dtype)
+        self._march.fields(later.numpy(), stencil.STATES, out.numpy())
+        self._now = later[-1].item()
+        displacement, velocity = out.reshape(2, *self._shape, len(later), self._n)
+        return Trajectory(times, displacement, velocity)
+
+
+METHOD = Method(
+    name="chebyshev",
+    start=start,
+    summary="Chebyshev expansion of the exact solution in powers of the stencil, without matrices",
+    order="exact to the accuracy asked for, at any output time",
+    conserves="energy and, on a ring, momentum, to the accuracy; time reversal and reciprocity likewise",
+    stability="unconditional: the spectrum lies below a rigorous bound, and a bound that is too small is refused",
+    cost="about W t / 2 stencils and 4 W sums of N numbers per unit of time (W: highest frequency); memory of a state",
+    cannot="damping, Hertz contacts",
+    threaded=True,
+    options={
+        "accuracy": "what truncation may leave out, relative to the size of the state, over 1024 segments (1e-12)",
+        "bound": "squared frequency that no mode exceeds, a number or (*batch,); by default a rigorous one",
+        "compiled": "False for the plain torch implementation on the CPU, too",
+    },
+)

@@ -1,0 +1,157 @@
+"""Energy in space and in wavenumber bands straight from the stencil, without storing the states.
+
+What ``evolve`` with method "chebyshev" and then ``particle_energy``, ``energy_center``, ``energy_width`` or
+``band_energy`` give, for ensembles: each chain stays in cache from the first time to the last and leaves only its
+observables behind. Tensors that the Numba kernels cannot treat go through those functions, a window of times after
+the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchchain import checks, energy, wavenumber
+from torchchain.chain import Chain
+from torchchain.evolvers import start
+from torchchain.evolvers.chebyshev import ROUNDING, CompiledAdvance
+from torchchain.excitation import State
+
+# Bytes of fields that the stencil leaves before their transform, enough to outweigh handing the work to threads; and
+# bytes transformed at a time, which stay in cache and below the size at which each allocation is fresh from the system.
+_CHUNK = 2**24
+_BLOCK = 2**21
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyMoments:
+    """Total energy, its center R (Eq. 37) and mean squared width r^2 (Eq. 38), each (*batch, *any, time).
+
+    The sums over particles p of E_p, p E_p and p^2 E_p are total, total * center and total * (width + center^2).
+    """
+
+    total: Tensor
+    center: Tensor
+    width: Tensor
+
+
+def energy_moments(chain: Chain, state: State, times: Any, definition: str = "site", **options: Any) -> EnergyMoments:
+    """Total, center and width of the energy of every output time.
+
+    Args:
+        chain: linear contacts, undamped, masses (*batch, particle).
+        state: the start, (*batch, *any, particle).
+        times: (time,), increasing, not negative; on a uniform grid the work halves.
+        definition: "site" (Eq. 36) or "bond" (Eq. A3), see :func:`torchchain.potential_energy`.
+        options: those of method "chebyshev"; without ``accuracy``, it is that of rounding.
+
+    Returns:
+        EnergyMoments, dtype and device of the state.
+
+    Raises:
+        FieldError: as ``evolve`` and ``energy_center`` do.
+    """
+    checks.choice("definition", definition, energy.DEFINITIONS)
+    times = checks.times("times", times)
+    advance = start(chain, state, "chebyshev", **{"accuracy": ROUNDING, **options})
+    shape = (*state.displacement.shape[:-1], len(times))
+    if not isinstance(advance, CompiledAdvance):
+        parts = []
+        for window in _windows(times, state):
+            here = energy.particle_energy(chain, advance(window), definition)
+            parts.append(torch.stack([here.sum(-1), energy.energy_center(here), energy.energy_width(here)]))
+        return EnergyMoments(*torch.cat(parts, dim=-1))
+    from torchchain.evolvers import stencil
+
+    kind = stencil.SITE_MOMENTS if definition == "site" else stencil.BOND_MOMENTS
+    march = stencil.March(advance.rows, mirrored=True)
+    moments = torch.from_numpy(march.moments(times.double().numpy(), kind)).to(state.displacement.dtype)
+    total, center, width = moments.reshape(*shape, 3).unbind(-1)
+    checks.first_bad("total energy", "be positive", total, ~(total > 0), "time")
+    return EnergyMoments(total, center, width)
+
+
+def band_energy(
+    chain: Chain,
+    state: State,
+    times: Any,
+    n_bands: int = 32,
+    normalize: bool = True,
+    definition: str = "site",
+    **options: Any,
+) -> Tensor:
+    """Energy in each wavenumber band at every output time (Eqs. 44-46).
+
+    Args:
+        chain: linear contacts, undamped, an even number of particles, masses (*batch, particle).
+        state: the start, (*batch, *any, particle), for instance an axis of tones.
+        times: (time,), increasing, not negative; on a uniform grid the work halves.
+        n_bands, normalize, definition: as in :func:`torchchain.band_energy`.
+        options: those of method "chebyshev"; without ``accuracy``, it is that of rounding.
+
+    Returns:
+        (*batch, *any, time, band), dtype and device of the state.
+
+    Raises:
+        FieldError: as ``evolve`` and ``band_energy`` do.
+    """
+    checks.choice("definition", definition, energy.DEFINITIONS)
+    wavenumber.check_bands(chain.n_particles, n_bands)
+    times = checks.times("times", times)
+    advance = start(chain, state, "chebyshev", **{"accuracy": ROUNDING, **options})
+    if definition == "bond" and chain.boundary != "periodic":
+        raise checks.fail("boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary))
+    if not isinstance(advance, CompiledAdvance):
+        return torch.cat(
+            [
+                wavenumber.band_energy(chain, advance(window), n_bands, normalize, definition)
+                for window in _windows(times, state)
+            ],
+            dim=-2,
+        )
+    from torchchain.evolvers import stencil
+
+    n, steps, rows = chain.n_particles, times.double().numpy(), advance.rows
+    kind = stencil.BOND_FIELDS
+    strain = np.zeros(n // 2 + 1)
+    if definition == "site":
+        kind = stencil.UNIFORM_FIELDS if chain.is_uniform_ring else stencil.SITE_FIELDS
+        strain += rows.contacts[0, 0] * 4 * np.sin(math.pi / n * np.arange(n // 2 + 1)) ** 2
+    fields = {stencil.BOND_FIELDS: 2, stencil.UNIFORM_FIELDS: 3, stencil.SITE_FIELDS: 4}[kind]
+    window = min(len(steps), max(1, _CHUNK // (8 * fields * n)))
+    size = min(rows.count, max(1, _CHUNK // (8 * fields * n * window)))
+    block = max(1, _BLOCK // (8 * fields * n))
+    memory = torch.empty(fields * size * window * n, dtype=torch.float64)
+    bands = np.empty((rows.count, len(steps), n_bands + 1))
+    with stencil.workers() as pool:
+        for begin, end in rows.chunks(size):
+            march = stencil.March(rows.select(begin, end), mirrored=True)
+            for first in range(0, len(steps), window):
+                last = min(first + window, len(steps))
+                states = (end - begin) * (last - first)
+                buffer = memory[: fields * states * n].view(fields, end - begin, last - first, n)
+                march.fields(steps[first:last], kind, buffer.numpy(), pool)
+                part = np.empty((states, n_bands + 1))
+                for low in range(0, states, block):
+                    spectra = torch.fft.rfft(buffer.view(fields, states, n)[:, low : low + block])
+                    stencil.bin_spectra(torch.view_as_real(spectra).flatten(2).numpy(), kind, strain, part[low:])
+                bands[begin:end, first:last] = part.reshape(end - begin, last - first, -1)
+    shape = (*state.displacement.shape[:-1], len(steps))
+    everything = torch.from_numpy(bands).reshape(*shape, n_bands + 1)
+    result, total = everything[..., :-1], everything[..., -1]
+    if normalize:
+        checks.first_bad("total energy", "be positive to normalize", total, ~(total > 0), "time")
+        result = result / total[..., None]
+    return result.to(state.displacement.dtype)
+
+
+def _windows(times: Tensor, state: State) -> Iterator[Tensor]:
+    """Windows of times whose states fit in some 100 MB."""
+    size = max(1, 2**23 // state.displacement.numel())
+    yield from times.to(state.displacement.device).split(size)
