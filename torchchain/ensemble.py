@@ -78,9 +78,6 @@ IN_TIME: dict[str, Observable] = {
 }
 
 
-FUSED = frozenset({"center", "total_energy", "width"})  # what the stencil's kernels measure without storing states
-
-
 class Stages:
     """Seconds spent in each named stage of a run; work on several threads counts its share of the time."""
 
@@ -136,7 +133,7 @@ class Chunk:
         """The named observables at all times, (realization, [tone,] *axes)."""
         if not names:
             return {}
-        if self.method == "chebyshev" and FUSED.issuperset(names):
+        if self.method == "chebyshev" and planning.MOMENTS.issuperset(names):
             with self.stages("evolution with observables"):
                 moments = energy_moments(
                     self.chain, self.state, self.times, self.scene.energy_definition, **self.options

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks, energy, wavenumber
+from torchchain.bands import check_bands
 from torchchain.chain import Chain
 from torchchain.evolvers import start
 from torchchain.evolvers.chebyshev import ROUNDING, CompiledAdvance
@@ -26,7 +27,7 @@ from torchchain.excitation import State
 # Bytes of fields that the stencil leaves before their transform, enough to outweigh handing the work to threads; and
 # bytes transformed at a time, which stay in cache and below the size at which each allocation is fresh from the system.
 _CHUNK = 2**24
-_BLOCK = 2**21
+_BLOCK = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +103,7 @@ def band_energy(
         FieldError: as ``evolve`` and ``band_energy`` do.
     """
     checks.choice("definition", definition, energy.DEFINITIONS)
-    wavenumber.check_bands(chain.n_particles, n_bands)
+    check_bands(chain.n_particles, n_bands)
     times = checks.times("times", times)
     advance = start(chain, state, "chebyshev", **{"accuracy": ROUNDING, **options})
     if definition == "bond" and chain.boundary != "periodic":
@@ -126,9 +127,10 @@ def band_energy(
     fields = {stencil.BOND_FIELDS: 2, stencil.UNIFORM_FIELDS: 3, stencil.SITE_FIELDS: 4}[kind]
     window = min(len(steps), max(1, _CHUNK // (8 * fields * n)))
     size = min(rows.count, max(1, _CHUNK // (8 * fields * n * window)))
-    block = max(1, _BLOCK // (8 * fields * n))
+    block = max(1, _BLOCK // (8 * n))
     memory = torch.empty(fields * size * window * n, dtype=torch.float64)
-    bands = np.empty((rows.count, len(steps), n_bands + 1))
+    bands = np.empty((rows.count, len(steps), n_bands))
+    totals = np.empty((rows.count, len(steps)))
     with stencil.workers() as pool:
         for begin, end in rows.chunks(size):
             march = stencil.March(rows.select(begin, end), mirrored=True)
@@ -137,18 +139,21 @@ def band_energy(
                 states = (end - begin) * (last - first)
                 buffer = memory[: fields * states * n].view(fields, end - begin, last - first, n)
                 march.fields(steps[first:last], kind, buffer.numpy(), pool)
-                part = np.empty((states, n_bands + 1))
+                part, total = np.empty((states, n_bands)), np.empty(states)
                 for low in range(0, states, block):
-                    spectra = torch.fft.rfft(buffer.view(fields, states, n)[:, low : low + block])
-                    stencil.bin_spectra(torch.view_as_real(spectra).flatten(2).numpy(), kind, strain, part[low:])
+                    spectra = [
+                        torch.view_as_real(torch.fft.rfft(field[low : low + block])).flatten(1).numpy()
+                        for field in buffer.view(fields, states, n)
+                    ]
+                    a, b, c, d = (*spectra, *spectra[:1] * (4 - fields))
+                    stencil.bin_spectra(a, b, c, d, kind, strain, normalize, part[low:], total[low:])
                 bands[begin:end, first:last] = part.reshape(end - begin, last - first, -1)
+                totals[begin:end, first:last] = total.reshape(end - begin, -1)
     shape = (*state.displacement.shape[:-1], len(steps))
-    everything = torch.from_numpy(bands).reshape(*shape, n_bands + 1)
-    result, total = everything[..., :-1], everything[..., -1]
     if normalize:
+        total = torch.from_numpy(totals).reshape(shape)
         checks.first_bad("total energy", "be positive to normalize", total, ~(total > 0), "time")
-        result = result / total[..., None]
-    return result.to(state.displacement.dtype)
+    return torch.from_numpy(bands).reshape(*shape, n_bands).to(state.displacement.dtype)
 
 
 def _windows(times: Tensor, state: State) -> Iterator[Tensor]:

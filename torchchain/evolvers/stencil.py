@@ -369,12 +369,17 @@ def _record_moments(w, row, u, v, kind, low, high, reference, out):
         The reference for the next state's moments, the particle at this center: the width must not come out as
         a small difference of large numbers.
     """
-    size = high - low
     if kind == SITE_MOMENTS:
+        size = high - low
         total, first, second = _moments_site(
             w, u + low, v + low, row.mass + low, row.contact + low, reference, low + 1.0, size
         )
     else:
+        # Half of the outermost contacts' energy belongs to the particles at rest beyond the window.
+        if row.periodic and (low == 0 or high == row.n):
+            low, high = 0, row.n
+        low, high = max(low - 1, 0), min(high + 1, row.n)
+        size = high - low
         total, first, second = _moments_bond(
             w, u + low, v + low, row.mass + low, row.contact + low, reference, low + 1.0, size
         )
@@ -393,24 +398,28 @@ def _record_moments(w, row, u, v, kind, low, high, reference, out):
 @_kernel
 def _record_fields(w, row, u, v, kind, out, r, i):
     """Leaves one state, or the fields that make up its energy in wavenumber space, in out[:, r, i]."""
-    n = row.n
+    n, one = _U(row.n), _U(1)
+    p, s, b, k = _U(u), _U(v), _U(row.mass), _U(row.contact)
+    first, second = out[0, r, i], out[1, r, i]
     if kind == STATES:
-        out[0, r, i] = w[u : u + n]
-        out[1, r, i] = w[v : v + n]
+        for q in range(n):
+            first[q] = w[p + q]
+            second[q] = w[s + q]
     elif kind == BOND_FIELDS:
-        for p in range(n):
-            out[0, r, i, p] = math.sqrt(w[row.mass + p]) * w[v + p]
-            out[1, r, i, p] = math.sqrt(w[row.contact + p]) * (w[u + p] - w[u + p - 1])
+        for q in range(n):
+            first[q] = math.sqrt(w[b + q]) * w[s + q]
+            second[q] = math.sqrt(w[k + q]) * (w[p + q] - w[p + q - one])
     else:
-        out[2, r, i] = w[u : u + n]
-        for p in range(n):
-            out[0, r, i, p] = w[v + p]
-            out[1, r, i, p] = w[row.mass + p] * w[v + p]
+        third = out[2, r, i]
+        for q in range(n):
+            first[q] = w[s + q]
+            second[q] = w[b + q] * w[s + q]
+            third[q] = w[p + q]
         if kind == SITE_FIELDS:
-            for p in range(n):
-                x = w[u + p]
-                left, right = w[row.contact + p], w[row.contact + p + 1]
-                out[3, r, i, p] = left * (x - w[u + p - 1]) + right * (x - w[u + p + 1])
+            fourth = out[3, r, i]
+            for q in range(n):
+                x = w[p + q]
+                fourth[q] = w[k + q] * (x - w[p + q - one]) + w[k + q + one] * (x - w[p + q + one])
 
 
 @_kernel
@@ -574,36 +583,35 @@ def march(
 
 
 @_summing_kernel
-def bin_spectra(spectra, kind, strain, bands):
+def bin_spectra(a, b, c, d, kind, strain, normalize, bands, totals):
     """Energies of wavenumbers (Eq. 43) summed into bands (Eq. 44).
 
     Args:
-        spectra: transforms of the fields that :func:`march` leaves, without a factor, (field, state, 2 (N/2 + 1)): the
-            real and the imaginary part of each wavenumber in turn.
+        a, b, c, d: transforms of the fields that :func:`march` leaves, without a factor, (state, 2 (N/2 + 1)): the real
+            and the imaginary part of each wavenumber in turn. Those that the kind does not have are not looked at.
         kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS.
         strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, (wavenumber,).
-        bands: (state, band + 1), written; the energy over all wavenumbers, k = 0 among them, comes last.
+        normalize: divide by the total.
+        bands: (state, band), written.
+        totals: energy of all wavenumbers, k = 0 among them, (state,), written.
     """
-    size = spectra.shape[2]
-    n_bands = bands.shape[1] - 1
+    size = a.shape[1]
+    n_bands = bands.shape[1]
     width = (size - 2) // n_bands
     # 1/2 for the energy and 1/N for the unitary transform; k and -k are two, except where they are one.
     scale = 1.0 / (size - 2)
     energy = np.empty(size)
     strains = np.repeat(strain, 2)
-    for s in range(spectra.shape[1]):
-        a, b = spectra[0, s], spectra[1, s]
+    for s in range(a.shape[0]):
         if kind == UNIFORM_FIELDS:
-            c = spectra[2, s]
             for k in range(size):
-                energy[k] = a[k] * b[k] + strains[k] * c[k] * c[k]
+                energy[k] = a[s, k] * b[s, k] + strains[k] * c[s, k] * c[s, k]
         elif kind == SITE_FIELDS:
-            c, d = spectra[2, s], spectra[3, s]
             for k in range(size):
-                energy[k] = a[k] * b[k] + c[k] * d[k]
+                energy[k] = a[s, k] * b[s, k] + c[s, k] * d[s, k]
         else:
             for k in range(size):
-                energy[k] = a[k] * a[k] + b[k] * b[k]
+                energy[k] = a[s, k] * a[s, k] + b[s, k] * b[s, k]
         energy[0] *= 0.5
         energy[size - 2] *= 0.5
         total = energy[0]
@@ -612,9 +620,12 @@ def bin_spectra(spectra, kind, strain, bands):
             start = _U(2 + band * width)
             for k in range(_U(width)):
                 part += energy[start + k]
-            bands[s, band] = part * scale
+            bands[s, band] = part
             total += part
-        bands[s, n_bands] = total * scale
+        factor = 1.0 / total if normalize else scale
+        for band in range(n_bands):
+            bands[s, band] *= factor
+        totals[s] = total * scale
 
 
 @dataclass(frozen=True, eq=False)
