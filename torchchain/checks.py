@@ -83,6 +83,17 @@ def choice(field: str, value: Any, choices: Iterable[str]) -> str:
     return value
 
 
+def device(field: str, value: Any) -> torch.device:
+    """The value as a device that this machine has: "cpu", "cuda" or "cuda:<number>"."""
+    try:
+        found = torch.empty(0, device=torch.device(value)).device
+    except (RuntimeError, AssertionError, TypeError) as error:
+        raise fail(field, "be available here", f"{value!r}: {str(error).splitlines()[0][:100]}") from None
+    if found.type not in ("cpu", "cuda"):
+        raise fail(field, "be cpu, cuda or cuda:<number>", repr(value))
+    return torch.device("cpu") if found.type == "cpu" else found
+
+
 def known_keys(field: str, given: Iterable[str], allowed: Iterable[str]) -> None:
     """An error that names the first key that is not allowed."""
     allowed = tuple(allowed)

@@ -59,16 +59,6 @@ def _scene(flags: SceneFlags, tables: tuple[str, ...] = ()) -> tuple[Scene, dict
     return Scene.from_dict(_merge(config, given)), extra
 
 
-def _device(name: str) -> str:
-    try:
-        kind = torch.empty(0, device=torch.device(name)).device.type
-    except (RuntimeError, AssertionError) as error:
-        raise checks.fail("device", "be available here", f"{name!r}: {str(error).splitlines()[0][:100]}") from None
-    if kind not in ("cpu", "cuda"):
-        raise checks.fail("device", "be cpu, cuda or cuda:<number>", repr(name))
-    return "cpu" if kind == "cpu" else name
-
-
 def _figure(width: float, height: float, rows: int, columns: int) -> Any:
     import matplotlib.figure
 
@@ -84,7 +74,7 @@ def run_simulate(flags: Simulate, arguments: list[str]) -> None:
     """Measure a scene's observables and leave config, data, figure and record in the output folder."""
     began = time.time()
     scene, _ = _scene(flags)
-    out, device = outputs.check_writable(flags.out), _device(flags.device)
+    out, device = outputs.check_writable(flags.out), str(checks.device("device", flags.device))
     checks.choice("method", flags.method, ("auto", *METHODS))
     stages = Stages()
     data = simulate(scene, flags.method, device=device, progress=True, stages=stages)
@@ -149,7 +139,7 @@ def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])
-    out, device = outputs.check_writable(flags.out), _device(flags.device)
+    out, device = outputs.check_writable(flags.out), str(checks.device("device", flags.device))
     checks.choice("method", flags.method, ("auto", *METHODS))
     stages = Stages()
     transfer = band_transfer(scene, flags.method, device=device, progress=True, stages=stages)
@@ -273,7 +263,7 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
     given = _merge(config, flags.overrides())
     checks.known_keys("predict", given, PREDICT_KEYS)
     checks.choice("method", flags.method, SOLVERS)
-    out, device = outputs.check_writable(flags.out), _device(flags.device)
+    out, device = outputs.check_writable(flags.out), str(checks.device("device", flags.device))
     stages = Stages()
     with stages("loading"):
         master = MasterEquation.load(flags.model).to(device)

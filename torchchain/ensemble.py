@@ -199,11 +199,13 @@ def stream(
         first two moments under "mass_moments".
     """
     options = dict(options or {})
+    checks.choice("method", method, ("auto", *METHODS))
+    device = checks.device("device", device)
     if method == "auto":
         plan = planning.plan(scene)
         method, options = plan.method, {**plan.options, **options}
     stages = stages or Stages()
-    on_cpu = torch.device(device).type == "cpu"
+    on_cpu = device.type == "cpu"
     workers = torch.get_num_threads() if on_cpu and not METHODS[method].threaded else 1
     budget = checks.integer("memory_budget", memory_budget, 1) // workers
     check_amplitude(scene)

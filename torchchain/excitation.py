@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -71,7 +72,7 @@ def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float 
     """
     n = chain.n_particles
     several = checks.is_collection(tone)
-    tones = list(tone) if checks.is_collection(tone) else [tone]
+    tones: list[Any] = list(tone) if checks.is_collection(tone) else [tone]
     if not tones:
         raise checks.fail("tone", "hold at least one tone", "none")
     amplitude = checks.number("amplitude", amplitude)

@@ -261,7 +261,8 @@ class CompiledAdvance:
 
         later = _later(times, self._now)
         out = torch.empty((2, self.rows.count, len(later), self._n), dtype=self._dtype)
-        self._march.fields(later.numpy(), stencil.STATES, out.numpy())
+        steps, states = later.numpy(), out.numpy()
+        stencil.share(lambda begin, end: self._march.fields(begin, end, steps, stencil.STATES, states), self.rows.count)
         self._now = later[-1].item()
         displacement, velocity = out.reshape(2, *self._shape, len(later), self._n)
         return Trajectory(times, displacement, velocity)

@@ -24,10 +24,8 @@ from torchchain.evolvers import start
 from torchchain.evolvers.chebyshev import ROUNDING, CompiledAdvance
 from torchchain.excitation import State
 
-# Bytes of fields that the stencil leaves before their transform, enough to outweigh handing the work to threads; and
-# bytes transformed at a time, which stay in cache and below the size at which each allocation is fresh from the system.
-_CHUNK = 2**24
-_BLOCK = 2**20
+# Bytes of one field that a thread takes from the stencil through the transform at a time: what it holds stays in cache.
+_BLOCK = 2**19
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +69,10 @@ def energy_moments(chain: Chain, state: State, times: Any, definition: str = "si
     from torchchain.evolvers import stencil
 
     kind = stencil.SITE_MOMENTS if definition == "site" else stencil.BOND_MOMENTS
-    march = stencil.March(advance.rows, mirrored=True)
-    moments = torch.from_numpy(march.moments(times.double().numpy(), kind)).to(state.displacement.dtype)
+    march, steps = stencil.March(advance.rows, mirrored=True), times.double().numpy()
+    out = np.empty((advance.rows.count, len(steps), 3))
+    stencil.share(lambda begin, end: march.moments(begin, end, steps, kind, out), advance.rows.count)
+    moments = torch.from_numpy(out).to(state.displacement.dtype)
     total, center, width = moments.reshape(*shape, 3).unbind(-1)
     checks.first_bad("total energy", "be positive", total, ~(total > 0), "time")
     return EnergyMoments(total, center, width)
@@ -119,36 +119,31 @@ def band_energy(
     from torchchain.evolvers import stencil
 
     n, steps, rows = chain.n_particles, times.double().numpy(), advance.rows
-    kind = stencil.BOND_FIELDS
+    kind, count = stencil.BOND_FIELDS, 2
     strain = np.zeros(n // 2 + 1)
     if definition == "site":
-        kind = stencil.UNIFORM_FIELDS if chain.is_uniform_ring else stencil.SITE_FIELDS
+        kind, count = (stencil.UNIFORM_FIELDS, 3) if chain.is_uniform_ring else (stencil.SITE_FIELDS, 4)
         strain += rows.contacts[0, 0] * 4 * np.sin(math.pi / n * np.arange(n // 2 + 1)) ** 2
-    fields = {stencil.BOND_FIELDS: 2, stencil.UNIFORM_FIELDS: 3, stencil.SITE_FIELDS: 4}[kind]
-    window = min(len(steps), max(1, _CHUNK // (8 * fields * n)))
-    size = min(rows.count, max(1, _CHUNK // (8 * fields * n * window)))
-    block = max(1, _BLOCK // (8 * n))
-    memory = torch.empty(fields * size * window * n, dtype=torch.float64)
-    bands = np.empty((rows.count, len(steps), n_bands))
-    totals = np.empty((rows.count, len(steps)))
-    with stencil.workers() as pool:
-        for begin, end in rows.chunks(size):
-            march = stencil.March(rows.select(begin, end), mirrored=True)
+    window = min(len(steps), max(1, _BLOCK // (8 * n)))
+    size = min(rows.count, max(1, _BLOCK // (8 * n * window)))
+    march = stencil.March(rows, mirrored=True)
+    bands, totals = np.empty((rows.count, len(steps), n_bands)), np.empty((rows.count, len(steps)))
+
+    def work(begin: int, end: int) -> None:
+        buffer = torch.empty(count * size * window * n, dtype=torch.float64)
+        for low in range(begin, end, size):
+            high = min(low + size, end)
             for first in range(0, len(steps), window):
                 last = min(first + window, len(steps))
-                states = (end - begin) * (last - first)
-                buffer = memory[: fields * states * n].view(fields, end - begin, last - first, n)
-                march.fields(steps[first:last], kind, buffer.numpy(), pool)
-                part, total = np.empty((states, n_bands)), np.empty(states)
-                for low in range(0, states, block):
-                    spectra = [
-                        torch.view_as_real(torch.fft.rfft(field[low : low + block])).flatten(1).numpy()
-                        for field in buffer.view(fields, states, n)
-                    ]
-                    a, b, c, d = (*spectra, *spectra[:1] * (4 - fields))
-                    stencil.bin_spectra(a, b, c, d, kind, strain, normalize, part[low:], total[low:])
-                bands[begin:end, first:last] = part.reshape(end - begin, last - first, -1)
-                totals[begin:end, first:last] = total.reshape(end - begin, -1)
+                shape = (count, high - low, last - first, n)
+                fields = buffer[: math.prod(shape)].view(shape)
+                march.fields(low, high, steps[first:last], kind, fields.numpy(), low)
+                spectra = [torch.view_as_real(torch.fft.rfft(field)).flatten(2).numpy() for field in fields]
+                a, b, c, d = (*spectra, *spectra[:1] * (4 - count))
+                here = slice(low, high), slice(first, last)
+                stencil.bin_spectra(a, b, c, d, kind, strain, normalize, bands[here], totals[here])
+
+    stencil.share(work, rows.count)
     shape = (*state.displacement.shape[:-1], len(steps))
     if normalize:
         total = torch.from_numpy(totals).reshape(shape)

@@ -25,11 +25,9 @@ Importing this file imports Numba; :mod:`chebyshev` does it at the first use.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +35,7 @@ import torch
 from numba import njit
 
 from torchchain.evolvers.chebyshev import LEAP
+from torchchain.threads import map_in_order
 
 # What a march leaves behind at every output time; the fields are those whose transforms make the energy of a
 # wavenumber. Kinds 3 and up write as many fields as they name.
@@ -422,10 +421,99 @@ def _record_fields(w, row, u, v, kind, out, r, i):
                 fourth[q] = w[k + q] * (x - w[p + q - one]) + w[k + q + one] * (x - w[p + q + one])
 
 
+class Tables(NamedTuple):
+    """Coefficients for the times of a segment, (time, term)."""
+
+    offsets: np.ndarray  # time after the anchor; -1: none yet
+    terms: np.ndarray
+    cosine: np.ndarray
+    drift: np.ndarray
+    slope: np.ndarray
+    twice_cosine: np.ndarray
+    twice_slope: np.ndarray
+    bessel: np.ndarray  # scratch
+
+
+@_kernel
+def _tabulate(tables, frequency, tolerance, anchor, times, leaps, slack):
+    """Fills the tables for these times, or for the first of the leaps to them, unless they hold them already.
+
+    Returns:
+        Whether the tables are filled anew.
+    """
+    known = leaps == 1
+    for j in range(times.size):
+        known = known and abs(times[j] - anchor - tables.offsets[j]) <= slack * times[j]
+    if known:
+        return False
+    for j in range(times.size):
+        offset = (times[j] - anchor) / leaps
+        tables.offsets[j] = offset
+        tables.terms[j] = _coefficients(
+            frequency, offset, tolerance, tables.bessel, tables.cosine[j], tables.drift[j], tables.slope[j]
+        )
+        for k in range(tables.terms[j]):
+            tables.twice_cosine[j, k] = 2.0 * tables.cosine[j, k]
+            tables.twice_slope[j, k] = 2.0 * tables.slope[j, k]
+    return True
+
+
+@_kernel
+def _lay_out(w, row, masses, contacts, stiff):
+    """Puts one chain into the scratch; returns whether both contacts of every particle are equally stiff."""
+    even = True
+    for p in range(row.n):
+        mass, left, right = masses[p], contacts[p], contacts[p + 1]
+        w[row.mass + p], w[row.contact + p] = mass, left
+        w[row.left + p], w[row.right + p] = left / (mass * stiff), right / (mass * stiff)
+        even = even and left == right
+    w[row.contact + row.n] = contacts[row.n]
+    return even
+
+
+@_kernel
+def _reverse(values, last):
+    """Turns values[: last + 1] around."""
+    for j in range((last + 1) // 2):
+        values[j], values[last - j] = values[last - j], values[j]
+
+
+@_kernel
+def _advance(w, row, u, v, low, high, count, tables, mirror):
+    """The states after the anchor u[0], v[0], put into rows 1 to count; returns the window that they fill."""
+    if mirror:
+        return _expand(
+            w,
+            row,
+            u[0],
+            low,
+            high,
+            count,
+            u[1:],
+            v[1:],
+            tables.terms,
+            tables.twice_cosine,
+            tables.twice_slope,
+            -1.0,
+            1.0,
+        )
+    start, stop, keep = low, high, 0.0
+    if not _silent(w, v[0], low, high):
+        start, stop = _expand(
+            w, row, v[0], low, high, count, u[1:], v[1:], tables.terms, tables.drift, tables.cosine, 0.0, 0.0
+        )
+        keep = 1.0
+    if keep == 0.0 or not _silent(w, u[0], low, high):
+        start, stop = _expand(
+            w, row, u[0], low, high, count, u[1:], v[1:], tables.terms, tables.cosine, tables.slope, keep, keep
+        )
+    return start, stop
+
+
 @_kernel
 def march(
     begin, end, masses, contacts, frequencies, starts, periodic, times, tolerance, mirrored, kind,
-    anchors, latest, clock, fields, moments,
+    anchors, latest, clock, fields, moments, first,
 ):  # fmt: skip
     """Evolves rows begin to end - 1 through the times, each in cache from the first time to the last.
 
@@ -445,11 +533,12 @@ def march(
         anchors, latest: states (row, 2, particle) at the last anchor and at the last time, updated.
         clock: (row, 4): time of the anchor, times since it, last time, and twice the energy at the start (negative
             while unknown), updated.
-        fields: (field, row, time, particle), written if the kind is one of states or fields.
-        moments: (row, time, 3), total, center and width, written if the kind is one of moments.
+        fields: (field, row - first, time, particle), written if the kind is one of states or fields.
+        moments: (row - first, time, 3), total, center and width, written if the kind is one of moments.
+        first: the row that comes first in ``fields`` or ``moments``.
     """
-    n = masses.shape[1]
-    steps = times.size
+    n, steps = masses.shape[1], times.size
+    slack = _SLACK if mirrored else 0.0
     stride = 8 * ((n + 2 * _PAD + 7) // 8)
     w = np.zeros((4 + _RING + 2 * (LONGEST + 1)) * stride)
     ring = (4 + np.arange(_RING)) * stride + _PAD
@@ -460,13 +549,18 @@ def march(
     longest_gap = times[0] - clock[begin, 2]
     for i in range(1, steps):
         longest_gap = max(longest_gap, times[i] - times[i - 1])
-    top = _top_order(1.001 * max(REACH, frequencies.max() * longest_gap))
-    bessel = np.empty(top + 1)
-    offsets = np.zeros(LONGEST)  # of the times after an anchor whose coefficients the tables hold
-    terms = np.zeros(LONGEST, np.int64)
-    cosine = np.zeros((LONGEST, 4 * (top // 8 + 1)))
-    drift, slope = np.zeros_like(cosine), np.zeros_like(cosine)
-    twice_cosine, twice_slope = np.zeros_like(cosine), np.zeros_like(cosine)
+    top = _top_order(1.001 * max(REACH, min(LEAP, frequencies.max() * longest_gap)))
+    table = np.zeros((5, LONGEST, 4 * (top // 8 + 1)))
+    tables = Tables(
+        np.zeros(LONGEST),
+        np.zeros(LONGEST, np.int64),
+        table[0],
+        table[1],
+        table[2],
+        table[3],
+        table[4],
+        np.empty(top + 1),
+    )
 
     realization = -1
     row = Row(n, periodic, True, _PAD, stride + _PAD, 2 * stride + _PAD, 3 * stride + _PAD, ring)
@@ -476,23 +570,15 @@ def march(
             realization = r // starts
             frequency = frequencies[realization]
             stiff = 0.25 * frequency * frequency
-            even = True
-            for p in range(n):
-                mass, left, right = masses[realization, p], contacts[realization, p], contacts[realization, p + 1]
-                w[row.mass + p], w[row.contact + p] = mass, left
-                w[row.left + p], w[row.right + p] = left / (mass * stiff), right / (mass * stiff)
-                even = even and left == right
-            w[row.contact + n] = contacts[realization, n]
+            even = _lay_out(w, row, masses[realization], contacts[realization], stiff)
             row = Row(n, periodic, even, row.mass, row.contact, row.left, row.right, ring)
-            offsets[:] = -1.0
+            tables.offsets[:] = -1.0
         _clear(w, ring[0] - _PAD, w.size)
         for j in range(LONGEST + 1):
             u[j] = (4 + _RING + 2 * j) * stride + _PAD
             v[j] = u[j] + stride
-        w[u[0] : u[0] + n] = anchors[r, 0]
-        w[v[0] : v[0] + n] = anchors[r, 1]
-        w[u[1] : u[1] + n] = latest[r, 0]
-        w[v[1] : v[1] + n] = latest[r, 1]
+        w[u[0] : u[0] + n], w[v[0] : v[0] + n] = anchors[r, 0], anchors[r, 1]
+        w[u[1] : u[1] + n], w[v[1] : v[1] + n] = latest[r, 0], latest[r, 1]
         anchor, since = clock[r, 0], int(clock[r, 1])
         when[0], when[1] = anchor, clock[r, 2]
         if clock[r, 3] < 0:
@@ -508,61 +594,31 @@ def march(
         while i < steps:
             if since > 0 and (since >= LONGEST or frequency * (times[i] - anchor) > REACH):
                 # The latest state becomes the anchor, and those before it follow in order.
-                for j in range((here + 1) // 2):
-                    u[j], u[here - j] = u[here - j], u[j]
-                    v[j], v[here - j] = v[here - j], v[j]
-                    when[j], when[here - j] = when[here - j], when[j]
+                _reverse(u, here)
+                _reverse(v, here)
+                _reverse(when, here)
                 history = here if mirrored else 0
                 low, high = _trim(w, row, u, v, history + 1, stiff, limit, start, stop)
                 anchor, since, here = when[0], 0, 0
-            count = 0
-            leaps = math.ceil(frequency * (times[i] - anchor) / LEAP)
-            if since == 0 and times[i] == anchor:
-                count = 1
-            else:
-                # The times of this segment, with their coefficients unless they are at hand.
-                known = True
-                while i + count < steps and since + count < LONGEST:
-                    ahead = times[i + count] - anchor
-                    if since + count > 0 and frequency * ahead > REACH:
-                        break
-                    slack = _SLACK * times[i + count] if mirrored else 0.0
-                    known = known and abs(ahead - offsets[count]) <= slack
+            count = 1
+            if since > 0 or times[i] > anchor:
+                while (
+                    i + count < steps and since + count < LONGEST and frequency * (times[i + count] - anchor) <= REACH
+                ):
                     count += 1
-                known = known and leaps == 1
-                mirror = mirrored and leaps == 1 and count <= history and age < RESTART
+                leaps = math.ceil(frequency * (times[i] - anchor) / LEAP)
+                _tabulate(tables, frequency, tolerance, anchor, times[i : i + count], leaps, slack)
+                mirror = leaps == 1 and count <= history and age < RESTART
                 for j in range(count):
-                    if not known:
-                        offsets[j] = (times[i + j] - anchor) / leaps
-                        terms[j] = _coefficients(
-                            frequency, offsets[j], tolerance, bessel, cosine[j], drift[j], slope[j]
-                        )
-                    if mirror and abs((anchor - when[j + 1]) - offsets[j]) > _SLACK * times[i + j]:
-                        mirror = False
-                if not known:
-                    twice_cosine[:] = 2.0 * cosine
-                    twice_slope[:] = 2.0 * slope
+                    passed = anchor - when[j + 1]
+                    mirror = mirror and abs(passed - tables.offsets[j]) <= slack * times[i + j]
                 if periodic:
                     _close(w, row, u[0])
                     _close(w, row, v[0])
-                if mirror:
-                    age += 1
-                    start, stop = _expand(
-                        w, row, u[0], low, high, count, u[1:], v[1:], terms, twice_cosine, twice_slope, -1.0, 1.0
-                    )
-                else:
-                    age, keep = 0, 0.0
-                    if not _silent(w, v[0], low, high):
-                        start, stop = _expand(
-                            w, row, v[0], low, high, count, u[1:], v[1:], terms, drift, cosine, 0.0, 0.0
-                        )
-                        keep = 1.0
-                    if keep == 0.0 or not _silent(w, u[0], low, high):
-                        start, stop = _expand(
-                            w, row, u[0], low, high, count, u[1:], v[1:], terms, cosine, slope, keep, keep
-                        )
+                start, stop = _advance(w, row, u, v, low, high, count, tables, mirror)
+                age = age + 1 if mirror else 0
                 for j in range(count):
-                    when[j + 1] = anchor + offsets[j] if mirrored or leaps > 1 else times[i + j]
+                    when[j + 1] = anchor + tables.offsets[j] if mirrored or leaps > 1 else times[i + j]
                 since += count
                 here = count
                 if leaps > 1:
@@ -572,10 +628,12 @@ def march(
                 if periodic:
                     _close(w, row, u[at])
                 if kind in (SITE_MOMENTS, BOND_MOMENTS):
-                    first, last = (start, stop) if since > 0 else (low, high)
-                    reference = _record_moments(w, row, u[at], v[at], kind, first, last, reference, moments[r, i + j])
+                    inner, outer = (start, stop) if since > 0 else (low, high)
+                    reference = _record_moments(
+                        w, row, u[at], v[at], kind, inner, outer, reference, moments[r - first, i + j]
+                    )
                 else:
-                    _record_fields(w, row, u[at], v[at], kind, fields, r, i + j)
+                    _record_fields(w, row, u[at], v[at], kind, fields, r - first, i + j)
             i += count
         anchors[r, 0], anchors[r, 1] = w[u[0] : u[0] + n], w[v[0] : v[0] + n]
         latest[r, 0], latest[r, 1] = w[u[here] : u[here] + n], w[v[here] : v[here] + n]
@@ -587,45 +645,46 @@ def bin_spectra(a, b, c, d, kind, strain, normalize, bands, totals):
     """Energies of wavenumbers (Eq. 43) summed into bands (Eq. 44).
 
     Args:
-        a, b, c, d: transforms of the fields that :func:`march` leaves, without a factor, (state, 2 (N/2 + 1)): the real
-            and the imaginary part of each wavenumber in turn. Those that the kind does not have are not looked at.
+        a, b, c, d: transforms of the fields that :func:`march` leaves, without a factor, (row, time, 2 (N/2 + 1)): the
+            real and the imaginary part of each wavenumber in turn. Those that the kind has not are not looked at.
         kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS.
         strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, (wavenumber,).
         normalize: divide by the total.
-        bands: (state, band), written.
-        totals: energy of all wavenumbers, k = 0 among them, (state,), written.
+        bands: (row, time, band), written.
+        totals: energy of all wavenumbers, k = 0 among them, (row, time), written.
     """
-    size = a.shape[1]
-    n_bands = bands.shape[1]
+    size, n_bands = a.shape[2], bands.shape[2]
     width = (size - 2) // n_bands
     # 1/2 for the energy and 1/N for the unitary transform; k and -k are two, except where they are one.
     scale = 1.0 / (size - 2)
     energy = np.empty(size)
     strains = np.repeat(strain, 2)
-    for s in range(a.shape[0]):
-        if kind == UNIFORM_FIELDS:
-            for k in range(size):
-                energy[k] = a[s, k] * b[s, k] + strains[k] * c[s, k] * c[s, k]
-        elif kind == SITE_FIELDS:
-            for k in range(size):
-                energy[k] = a[s, k] * b[s, k] + c[s, k] * d[s, k]
-        else:
-            for k in range(size):
-                energy[k] = a[s, k] * a[s, k] + b[s, k] * b[s, k]
-        energy[0] *= 0.5
-        energy[size - 2] *= 0.5
-        total = energy[0]
-        for band in range(n_bands):
-            part = 0.0
-            start = _U(2 + band * width)
-            for k in range(_U(width)):
-                part += energy[start + k]
-            bands[s, band] = part
-            total += part
-        factor = 1.0 / total if normalize else scale
-        for band in range(n_bands):
-            bands[s, band] *= factor
-        totals[s] = total * scale
+    for r in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            p, q, s, t = a[r, i], b[r, i], c[r, i], d[r, i]
+            if kind == UNIFORM_FIELDS:
+                for k in range(size):
+                    energy[k] = p[k] * q[k] + strains[k] * s[k] * s[k]
+            elif kind == SITE_FIELDS:
+                for k in range(size):
+                    energy[k] = p[k] * q[k] + s[k] * t[k]
+            else:
+                for k in range(size):
+                    energy[k] = p[k] * p[k] + q[k] * q[k]
+            energy[0] *= 0.5
+            energy[size - 2] *= 0.5
+            total = energy[0]
+            for band in range(n_bands):
+                part = 0.0
+                start = _U(2 + band * width)
+                for k in range(_U(width)):
+                    part += energy[start + k]
+                bands[r, i, band] = part
+                total += part
+            factor = 1.0 / total if normalize else scale
+            for band in range(n_bands):
+                bands[r, i, band] *= factor
+            totals[r, i] = total * scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -655,33 +714,14 @@ class Rows:
     def count(self) -> int:
         return len(self.displacement)
 
-    def chunks(self, size: int) -> Iterator[tuple[int, int]]:
-        """Ranges of at most ``size`` rows, each of whole realizations or within one, for :meth:`select`."""
-        if size >= self.starts:
-            size -= size % self.starts
-            for begin in range(0, self.count, size):
-                yield begin, min(begin + size, self.count)
-        else:
-            for first in range(0, self.count, self.starts):
-                for begin in range(first, first + self.starts, size):
-                    yield begin, min(begin + size, first + self.starts)
-
-    def select(self, begin: int, end: int) -> Rows:
-        """Rows begin to end - 1."""
-        chains = slice(begin // self.starts, (end - 1) // self.starts + 1)
-        return replace(
-            self,
-            masses=self.masses[chains],
-            contacts=self.contacts[chains],
-            frequencies=self.frequencies[chains],
-            displacement=self.displacement[begin:end],
-            velocity=self.velocity[begin:end],
-            starts=min(self.starts, end - begin),
-        )
-
 
 class March:
-    """Rows on their way through time; each call takes the next window of times."""
+    """Rows on their way through time; each call takes some of them to the next window of times.
+
+    Args:
+        rows: chains and starts.
+        mirrored: see :func:`march`.
+    """
 
     def __init__(self, rows: Rows, mirrored: bool = False) -> None:
         self.rows = rows
@@ -691,42 +731,32 @@ class March:
         self.clock = np.zeros((rows.count, 4))
         self.clock[:, 3] = -1
 
-    def fields(self, times: np.ndarray, kind: int, out: np.ndarray, pool: Executor | None = None) -> None:
-        """Leaves the states or fields of the kind in ``out``, (field, row, time, particle)."""
-        self._run(times, kind, out, np.empty((0, 0, 3)), pool)
+    def fields(self, begin: int, end: int, times: np.ndarray, kind: int, out: np.ndarray, first: int = 0) -> None:
+        """Leaves the states or fields of rows begin to end - 1 in ``out``, (field, row - first, time, particle)."""
+        self._run(begin, end, times, kind, out, np.empty((0, 0, 3)), first)
 
-    def moments(self, times: np.ndarray, kind: int, pool: Executor | None = None) -> np.ndarray:
-        """Total, center and width of the energy, (row, time, 3)."""
-        moments = np.empty((self.rows.count, len(times), 3))
-        self._run(times, kind, np.empty((0, 0, 0, 0)), moments, pool)
-        return moments
+    def moments(self, begin: int, end: int, times: np.ndarray, kind: int, out: np.ndarray) -> None:
+        """Leaves total, center and width of the energy of rows begin to end - 1 in ``out``, (row, time, 3)."""
+        self._run(begin, end, times, kind, np.empty((0, 0, 0, 0)), out, 0)
 
     def _run(
-        self, times: np.ndarray, kind: int, fields: np.ndarray, moments: np.ndarray, pool: Executor | None
+        self, begin: int, end: int, times: np.ndarray, kind: int, fields: np.ndarray, moments: np.ndarray, first: int
     ) -> None:
         rows = self.rows
-
-        def task(begin: int, end: int) -> None:
-            march(
-                begin, end, rows.masses, rows.contacts, rows.frequencies, rows.starts, rows.periodic, times,
-                rows.tolerance, self.mirrored, kind, self.anchors, self.latest, self.clock, fields, moments,
-            )  # fmt: skip
-
-        share(task, rows.count, pool)
+        march(
+            begin, end, rows.masses, rows.contacts, rows.frequencies, rows.starts, rows.periodic, times,
+            rows.tolerance, self.mirrored, kind, self.anchors, self.latest, self.clock, fields, moments, first,
+        )  # fmt: skip
 
 
-def workers() -> ThreadPoolExecutor:
-    """Threads for :func:`share`, as many as torch uses."""
-    return ThreadPoolExecutor(torch.get_num_threads())
+def share(work: Callable[[int, int], None], count: int, longest: int | None = None) -> None:
+    """Runs work(begin, end) over rows 0 to count - 1 side by side, in ranges of at most ``longest`` rows.
 
-
-def share(task: Callable[[int, int], None], count: int, pool: Executor | None = None) -> None:
-    """Runs task(begin, end) over 0 to count - 1 in threads, in a few pieces for each."""
-    threads = torch.get_num_threads()
-    if threads == 1 or count == 1:
-        task(0, count)
-        return
-    edges = np.unique(np.linspace(0, count, 4 * threads + 1).astype(int))
-    own = workers() if pool is None else contextlib.nullcontext(pool)
-    with own as executor:
-        list(executor.map(task, edges[:-1].tolist(), edges[1:].tolist()))
+    As many threads as torch uses, with a few ranges for each; within ``work``, torch uses one.
+    """
+    workers = min(torch.get_num_threads(), count)
+    size = -(-count // (4 * workers if workers > 1 else 1))
+    size = size if longest is None else min(size, longest)
+    ranges = [(begin, min(begin + size, count)) for begin in range(0, count, size)]
+    for _ in map_in_order(lambda part: work(*part), ranges, workers):
+        pass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import tempfile
 from collections.abc import Mapping
@@ -83,8 +82,8 @@ def save(model: TransferModel, record: Mapping[str, Any], path: str | Path) -> N
         except BaseException:
             os.unlink(temporary)
             raise
-    except OSError as error:
-        raise checks.fail(f"file {path}", "be writable", f"{error.strerror or error}") from None
+    except (OSError, SafetensorError, ValueError) as error:
+        raise checks.fail(f"file {path}", "be writable", f"{getattr(error, 'strerror', None) or error}") from None
 
 
 def load(path: str | Path) -> tuple[TransferModel, dict[str, Any]]:
@@ -103,7 +102,7 @@ def load(path: str | Path) -> tuple[TransferModel, dict[str, Any]]:
             tensors = _tensors(where, file, header)
     except OSError as error:
         raise checks.fail(where, "be a readable file", f"{error.strerror or error}") from None
-    except (SafetensorError, ValueError, TypeError, KeyError, OverflowError, MemoryError) as error:
+    except (SafetensorError, ValueError, TypeError, KeyError, OverflowError, MemoryError, RecursionError) as error:
         if isinstance(error, checks.FieldError):
             raise
         raise checks.fail(where, "be a master equation saved by torchchain", checks.shown(str(error))) from None
@@ -135,7 +134,7 @@ def _header(where: str, metadata: Mapping[str, str]) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise checks.fail(where, f"carry the format {FORMAT}", checks.shown(header))
     version = header.get("format_version")
-    if version != FORMAT_VERSION:
+    if version != FORMAT_VERSION or isinstance(version, bool):
         raise checks.fail(where, f"have format version {FORMAT_VERSION}", version)
     kinds: dict[str, tuple[type, ...]] = {
         "kind": (str,),
@@ -184,6 +183,7 @@ def _tensors(where: str, file: Any, header: Mapping[str, Any]) -> dict[str, torc
 
 
 def _window(value: list[Any]) -> tuple[float, float]:
-    if len(value) != 2 or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in value):
+    if len(value) != 2:
         raise checks.fail("window", "be two times", value)
-    return float(value[0]), float(value[1])
+    begin = checks.number("window", value[0], at_least=0)
+    return begin, checks.number("window", value[1], above=begin)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchchain import checks
 from torchchain.master import artifact
 from torchchain.master.model import TransferModel
-from torchchain.master.solvers import SOLVERS
+from torchchain.master.solvers import SOLVERS, IntegrationError
 from torchchain.scene import Scene
 from torchchain.threads import single_thread
 
@@ -84,8 +84,12 @@ class MasterEquation(nn.Module):
         initial = checks.real_tensor("initial", initial).to(self.rates)
         if initial.ndim == 0 or initial.shape[-1] != self.n_bands:
             raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}")
+        times = checks.times("times", times).to(self.rates)
         with single_thread():
-            return solver.run(self.model, initial, checks.times("times", times).to(self.rates), **options)
+            energy = solver.run(self.model, initial, times, **options)
+        if not bool(energy.isfinite().all()):
+            raise IntegrationError(f"solver '{method}' must stay finite, got overflow up to time {float(times[-1]):g}")
+        return energy
 
     def forward(self, initial: Tensor, times: Tensor) -> Tensor:
         """:meth:`solve` by the matrix exponential."""

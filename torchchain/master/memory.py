@@ -50,9 +50,9 @@ class MemoryModel(TransferModel):
         super().__init__()
         rates = checks.real_tensor("rates", rates)
         basis = checked_basis(basis, rates)
-        amplitudes = checks.real_tensor("amplitudes", amplitudes)
+        amplitudes = checks.real_tensor("amplitudes", amplitudes).to(rates)
         decay, pair_decay, pair_frequency = (
-            checks.real_tensor(name, value)
+            checks.real_tensor(name, value).to(rates)
             for name, value in (("decay", decay), ("pair_decay", pair_decay), ("pair_frequency", pair_frequency))
         )
         for name, value in (("decay", decay), ("pair_decay", pair_decay)):

@@ -74,7 +74,7 @@ def checked_basis(basis: Tensor, rates: Tensor) -> Tensor:
         raise checks.fail("basis", f"have shape {(n, n)} like the rates", f"shape {tuple(basis.shape)}")
     total = basis.sum(-1)
     checks.first_bad("basis", "have row sums of at most 1", total, total > 1 + 1e-6, "band")
-    return basis
+    return basis.to(rates)
 
 
 def checked_damping(damping: Tensor | None, rates: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ def checked_damping(damping: Tensor | None, rates: Tensor) -> Tensor:
     if tuple(damping.shape) != (len(rates),):
         raise checks.fail("damping", f"have shape {(len(rates),)} like the rates", f"shape {tuple(damping.shape)}")
     checks.first_bad("damping", "not be negative", damping, damping < 0, "band")
-    return damping
+    return damping.to(rates)
 
 
 class RateModel(TransferModel):

@@ -1,0 +1,290 @@
+"""What the figure scripts share: flags and config, the folder of a run, and the paper's numbers beside the measured."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+import torch
+import tyro
+import xarray
+from matplotlib.figure import Figure
+from torch import Tensor
+
+import torchchain as tc
+from torchchain import checks, outputs
+from torchchain.scene import read_toml, regular_times
+
+TIME = {"units": "travel time of sound over one particle", "long_name": "time t"}
+RATE = {"units": "1 / travel time of sound over one particle"}
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """The chains of Sections 4.2 to 4.5; a script's own settings follow."""
+
+    seed: int = 0
+    """seed of the ensemble"""
+    n_particles: int = 256
+    """particles per chain (the paper's N + 1)"""
+    n_bands: int = 32
+    """wavenumber bands B"""
+    realizations: int = 100
+    """chains in the ensemble"""
+    stop: float = 50.0
+    """last time"""
+    step: float = 0.25
+    """time step of the output"""
+
+    def scene(self, strength: float, tones: tuple[int, ...] | None = None, **changes: Any) -> tc.Scene:
+        """Standing waves on chains of this disorder; ``tones=None``: the center tone of every band."""
+        settings: dict[str, Any] = {
+            "n_particles": self.n_particles,
+            "n_bands": self.n_bands,
+            "realizations": self.realizations,
+            "seed": self.seed,
+            "times": regular_times(0.0, self.stop, self.step),
+            "disorder": tc.Disorder(strength=strength),
+            "excitation": tc.StandingWave(tones=tones),
+        }
+        return tc.Scene(**settings | changes)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: a measured number with its standard error, beside the paper's digits where it gives any."""
+
+    quantity: str
+    measured: float
+    stderr: float = math.nan
+    paper: str = ""
+    note: str = ""
+
+    @property
+    def sigmas(self) -> float:
+        """How far apart the numbers are: the paper's ensemble has the same size, hence the same error, and is rounded."""
+        if not self.paper or not self.stderr >= 0:
+            return math.nan
+        digit = 10.0 ** -len(self.paper.partition(".")[2])
+        return (self.measured - float(self.paper)) / math.sqrt(2 * self.stderr**2 + digit**2 / 12)
+
+
+@dataclass(frozen=True)
+class Script:
+    """A figure as a function of its config.
+
+    Attributes:
+        name: of the script and of its folder.
+        config: the paper's settings.
+        smoke: the same shrunk to seconds.
+        measure: (config, device) to the data, all that the figure and the table need.
+        draw: (data, config) to the figure, no computation.
+        compare: (data, config) to the table.
+        explain: (data, config) to what the table means, in words.
+    """
+
+    name: str
+    config: Any
+    smoke: Any
+    measure: Callable[[Any, str], xarray.Dataset]
+    draw: Callable[[xarray.Dataset, Any], Figure]
+    compare: Callable[[xarray.Dataset, Any], list[Row]]
+    explain: Callable[[xarray.Dataset, Any], str]
+
+
+def run(script: Script, arguments: Sequence[str] | None = None) -> int:
+    """Run or redraw a script; the exit status is 2 for bad input, with one line on standard error."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        flags = _read(script, arguments)
+        out = outputs.check_writable(flags.out)
+        if flags.redraw:
+            _redraw(script, flags, out)
+        else:
+            _run(script, flags, out, arguments)
+    except SystemExit as stop:  # the parser's: --help, or a flag that it has already complained of
+        return stop.code if isinstance(stop.code, int) else 2
+    except (checks.FieldError, checks.FieldTypeError) as error:
+        print(f"{script.name}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
+    began, stages = time.time(), {}
+    _check_device(flags.device)
+    data = script.measure(flags.settings, flags.device)
+    stages["measure"] = time.time() - began
+    rows = script.compare(data, flags.settings)
+    figure, report = script.draw(data, flags.settings), _report(script, data, flags.settings, rows)
+    stages["figure and table"] = time.time() - began - stages["measure"]
+    config = _toml(flags.settings)
+    outputs.write(
+        out,
+        {
+            "config.toml": outputs.text(config),
+            "results.nc": outputs.dataset(data.assign(_table(rows))),
+            "figure.png": _png(figure),
+            "report.txt": outputs.text(report),
+            "run.json": outputs.run_record(
+                arguments, config, flags.device, began, stages,
+                command=" ".join(["python", f"experiments/{script.name}.py", *arguments]), seed=flags.settings.seed,
+            ),
+        },
+    )  # fmt: skip
+    print(report, end="")
+    print(f"{time.time() - began:.1f} s, results in {out}")
+
+
+def _redraw(script: Script, flags: Any, out: Path) -> None:
+    """Figure and table again from the saved data."""
+    with xarray.open_dataset(out / "results.nc", engine="h5netcdf") as file:
+        data = file.load()
+    rows = script.compare(data, flags.settings)
+    report = _report(script, data, flags.settings, rows)
+    outputs.write(
+        out, {"figure.png": _png(script.draw(data, flags.settings)), "report.txt": outputs.text(report)}
+    )  # the data and their record stay
+    print(report, end="")
+    print(f"redrawn in {out}")
+
+
+def _read(script: Script, arguments: list[str]) -> Any:
+    """Flags over config file over the script's settings (or their smoke version), the same types checked in all."""
+    fields = {entry.name for entry in dataclasses.fields(script.config)}
+    first = _parse(script, script.config, arguments)
+    file = Path(first.out) / "config.toml" if first.redraw else first.config
+    given = {} if file is None else read_toml(file)
+    checks.known_keys(f"config {file}", given, sorted(fields))
+    base = script.smoke if first.smoke and not first.redraw else script.config
+    flags = _parse(script, base, [*_words(given), *arguments])
+    for name, value in dataclasses.asdict(flags.settings).items():
+        if value == ():
+            raise checks.fail(name, "hold at least one value", "none")
+        if first.redraw and _plain(value) != given.get(name):
+            raise checks.fail(name, f"stay {given.get(name)!r} as in the saved run to redraw it", repr(value))
+    return flags
+
+
+def _parse(script: Script, settings: Any, arguments: list[str]) -> Any:
+    kind = dataclasses.make_dataclass(
+        "Flags",
+        [
+            ("settings", tyro.conf.OmitArgPrefixes[type(settings)], settings),
+            ("config", str | None, dataclasses.field(default=None, metadata={"help": "settings in a TOML file"})),
+            ("out", str, f"results/experiments/{script.name}"),
+            ("device", str, "cpu"),
+            ("smoke", tyro.conf.FlagCreatePairsOff[bool], False),
+            ("redraw", tyro.conf.FlagCreatePairsOff[bool], False),
+        ],
+        frozen=True,
+    )
+    kind.__doc__ = f"{sys.modules[script.measure.__module__].__doc__}"
+    caught = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(caught):
+            return tyro.cli(kind, args=arguments, prog=script.name)
+    except SystemExit as stop:
+        if stop.code:
+            lines = [line.strip("│╭╮╰╯─ ") for line in caught.getvalue().splitlines()]
+            text = " ".join(" ".join(lines).split())
+            print(f"{script.name}: error: {text.partition(' For full helptext')[0]}", file=sys.stderr)
+        raise
+
+
+def _words(given: dict[str, Any]) -> list[str]:
+    """The keys of a config file as flags."""
+    words: list[str] = []
+    for key, value in given.items():
+        words += [f"--{key.replace('_', '-')}", *(str(v) for v in (value if isinstance(value, list) else [value]))]
+    return words
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(v) for v in value] if isinstance(value, tuple) else value
+
+
+def _toml(settings: Any) -> str:
+    return tomli_w.dumps({name: _plain(value) for name, value in dataclasses.asdict(settings).items()})
+
+
+def _check_device(name: str) -> None:
+    try:
+        torch.empty(0, device=torch.device(name))
+    except (RuntimeError, AssertionError) as error:
+        raise checks.fail("device", "be available here", f"{name!r}: {str(error).splitlines()[0][:100]}") from None
+
+
+def _png(figure: Figure) -> outputs.Writer:
+    return lambda path: figure.savefig(path, dpi=150)
+
+
+def _table(rows: list[Row]) -> dict[str, Any]:
+    """The rows as variables of the data."""
+    return {
+        f"row_{entry.name}": ("row", [getattr(row, entry.name) for row in rows]) for entry in dataclasses.fields(Row)
+    }
+
+
+def _report(script: Script, data: xarray.Dataset, config: Any, rows: list[Row]) -> str:
+    """The table as text, and the words below it."""
+    lines = [("quantity", "paper", "measured", "sigmas", "")]
+    for row in rows:
+        error = "" if math.isnan(row.stderr) else f" +- {row.stderr:.2g}"
+        lines.append(
+            (
+                row.quantity,
+                row.paper,
+                f"{row.measured:.4g}{error}",
+                "" if math.isnan(row.sigmas) else f"{row.sigmas:+.1f}",
+                row.note,
+            )
+        )
+    filled = [column for column in zip(*lines, strict=True) if any(column[1:])]
+    widths = [max(map(len, column)) for column in filled]
+    table = ["  ".join(f"{c:<{w}}" for c, w in zip(line, widths, strict=True)) for line in zip(*filled, strict=True)]
+    return "\n".join([script.name, *(line.rstrip() for line in table), script.explain(data, config).strip()]) + "\n"
+
+
+def panels(rows: int, columns: int, width: float = 4.8, height: float = 3.7) -> tuple[Figure, np.ndarray]:
+    """A figure and its axes [row, column]; width and height of one of them in inches."""
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def jackknife(
+    blocks: Tensor, counts: Sequence[int], statistic: Callable[[Tensor], Tensor], groups: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """A statistic of an ensemble mean and its standard error, by leaving out one block of realizations at a time.
+
+    Args:
+        blocks: means over the blocks, (block, ...).
+        counts: realizations in each block.
+        statistic: of the mean (...), any shape.
+        groups: leave out this many times, a group of blocks each; None for every block.
+
+    Returns:
+        The statistic of the whole mean, and its standard error (nan for a single block).
+    """
+    weight = torch.tensor(counts, dtype=blocks.dtype)
+
+    def mean(part: Tensor) -> Tensor:
+        return torch.einsum("b,b...->...", weight[part] / weight[part].sum(), blocks[part])
+
+    every = torch.arange(len(blocks))
+    value = statistic(mean(every))
+    n = min(groups or len(blocks), len(blocks))
+    if n < 2:
+        return value, torch.full_like(value, torch.nan)
+    left_out = torch.stack([statistic(mean(every[every % n != group])) for group in range(n)])
+    return value, ((n - 1) / n * (left_out - left_out.mean(0)).square().sum(0)).sqrt()

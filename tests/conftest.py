@@ -1,0 +1,35 @@
+"""What the tests share: one thread, a cache of their own, a small ensemble."""
+
+import pytest
+import torch
+
+import torchchain as tc
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread():
+    """The matrices are small, and the cores are shared."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def own_cache(tmp_path_factory):
+    """Speeds of the machine are neither read from nor left in the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCHCHAIN_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def small_scene():
+    """Twelve rings of 32 particles, four bands, 21 times."""
+    return tc.Scene(n_particles=32, n_bands=4, realizations=12, seed=7, times=torch.arange(21, dtype=torch.float64) / 4)
+
+
+@pytest.fixture(scope="session")
+def small_transfer(small_scene):
+    """The transfer between its bands, by normal modes."""
+    return tc.band_transfer(small_scene, "modes")

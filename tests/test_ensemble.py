@@ -1,0 +1,313 @@
+import tomllib
+from dataclasses import replace
+
+import literal
+import numpy as np
+import pytest
+import torch
+import xarray
+
+import torchchain as tc
+from torchchain.checks import FieldError, FieldTypeError
+from torchchain.ensemble import Stages, stream
+from torchchain.scene import OBSERVABLES
+
+TIMES = [0.0, 0.7, 5.0, 90.0]
+
+
+def reference(scene, i):
+    """All observables of realization i of a scene, for every tone, by the literal equations."""
+    n = scene.n_particles
+    masses = scene.disorder.masses(n, [i], scene.seed)[0].numpy()
+    stiffness = np.ones(n + (scene.boundary == "fixed"))
+    if scene.stiffness_disorder is not None:
+        stiffness = scene.stiffness_disorder.stiffnesses(len(stiffness), [i], scene.seed)[0].numpy()
+    matrix = literal.stiffness_matrix(stiffness, n, scene.boundary)
+    particle = np.arange(1, n + 1)
+    if scene.tones:
+        starts = [(0.01 * np.sin(2 * np.pi * tone * particle / n), np.zeros(n)) for tone in scene.tones]
+    else:
+        starts = [(np.zeros(n), scene.excitation.velocity * (particle == scene.excitation.site))]
+    found = {name: [] for name in OBSERVABLES}
+    for u0, v0 in starts:
+        rows = {name: [] for name in OBSERVABLES}
+        for u, v in zip(*literal.states(masses, matrix, u0, v0, scene.times.numpy()), strict=True):
+            total = np.diag(masses) @ np.outer(v, v) / 2 - matrix @ np.outer(u, u) / 2
+            energy = np.diag(total)
+            center = (particle * energy).sum() / energy.sum()
+            rows["displacement"].append(u)
+            rows["energy"].append(energy)
+            rows["source_energy"].append(energy[getattr(scene.excitation, "site", 1) - 1])
+            rows["total_energy"].append(energy.sum())
+            rows["center"].append(center)
+            rows["width"].append(((particle - center) ** 2 * energy).sum() / energy.sum())
+            rows["wavenumber_energy"].append(literal.wavenumber_energy(total).real)
+            rows["band_energy"].append(literal.band_energy(masses, matrix, u, v, scene.n_bands))
+        for name, row in rows.items():
+            found[name].append(np.array(row))
+        found["long_time_band_energy"][-1] = literal.long_time_band_energy(masses, matrix, u0, v0, scene.n_bands)
+    return {name: np.array(values) if scene.tones else values[0] for name, values in found.items()}
+
+
+COMMON = {"n_particles": 16, "n_bands": 4, "realizations": 5, "seed": 3, "times": TIMES, "observables": OBSERVABLES}
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"excitation": tc.StandingWave((1, 3, 6))},
+        {"excitation": tc.Impulse(6, 0.02)},
+        {"excitation": tc.Impulse(1), "boundary": "fixed"},
+        {"excitation": tc.StandingWave((5,)), "stiffness_disorder": tc.Disorder("gamma", 0.2)},
+    ],
+    ids=["waves", "kick", "wall", "stiffness"],
+)
+def test_means_and_errors_of_all_observables(fields):
+    scene = tc.Scene(**COMMON, **fields)
+    data = tc.simulate(scene, "modes")
+    single = [reference(scene, i) for i in range(5)]
+    for name in OBSERVABLES:
+        values = np.stack([found[name] for found in single])
+        scale = abs(values).max()
+        # The literal frequencies are good for a phase of 1e-12 at t = 90; the center weighs energies by 16.
+        np.testing.assert_allclose(data[name].values, values.mean(0), rtol=0, atol=1e-10 * scale)
+        error = values.std(0, ddof=1) / np.sqrt(5)
+        np.testing.assert_allclose(data[f"{name}_stderr"].values, error, rtol=0, atol=1e-10 * scale)
+    masses = scene.disorder.masses(16, 5, 3).numpy()
+    assert data.attrs["mass_mean"] == pytest.approx(masses.mean(), rel=1e-14)
+    assert data.attrs["mass_sd"] == pytest.approx(masses.std(), rel=1e-12)
+
+
+def test_labels_and_units():
+    data = tc.simulate(tc.Scene(**COMMON), "modes")
+    assert data["energy"].dims == ("tone", "time", "particle")
+    assert data["band_energy"].dims == ("tone", "time", "band")
+    assert data["long_time_band_energy"].dims == ("tone", "band")
+    assert data["tone"].values.tolist() == [1, 3, 5, 7]
+    assert data["particle"].values.tolist() == list(range(1, 17))
+    assert data["band"].values.tolist() == [1, 2, 3, 4]
+    np.testing.assert_allclose(data["wavenumber"].values, np.arange(9) * np.pi / 8)
+    np.testing.assert_array_equal(data["time"].values, TIMES)
+    assert all("units" in data[name].attrs and "long_name" in data[name].attrs for name in OBSERVABLES)
+    assert tc.Scene.from_dict(tomllib.loads(data.attrs["scene"])).to_dict() == tc.Scene(**COMMON).to_dict()
+
+
+def test_bond_definition_reaches_every_observable():
+    scene = tc.Scene(**COMMON, energy_definition="bond")
+    data = tc.simulate(scene, "modes")
+    assert (data["energy"].values >= 0).all()
+    assert (data["wavenumber_energy"].values >= 0).all()
+    chain = scene.chain(range(5))
+    late = tc.long_time_band_energy(chain, scene.state(chain), 4, definition="bond").mean(0)
+    np.testing.assert_allclose(data["long_time_band_energy"].values, late.numpy(), rtol=1e-12)
+    site = tc.simulate(replace(scene, energy_definition="site"), "modes")
+    assert abs(site["long_time_band_energy"] - data["long_time_band_energy"]).max() > 1e-3
+
+
+def equal(a, b):
+    return all(np.array_equal(a[name].values, b[name].values) for name in a.data_vars)
+
+
+@pytest.mark.parametrize("budget", [1, 2**17, 2**20, 2**23])
+def test_memory_budget_changes_nothing(budget):
+    # From one time of one chain at once up to everything at once.
+    scene = tc.Scene(**{**COMMON, "realizations": 11})
+    whole, cut = tc.simulate(scene, "modes"), tc.simulate(scene, "modes", memory_budget=budget)
+    for name in whole.data_vars:
+        # batched products may round differently for another number of rows, and nothing else
+        scale = abs(whole[name].values).max()
+        np.testing.assert_allclose(cut[name].values, whole[name].values, rtol=0, atol=1e-13 * scale)
+
+
+def test_windows_and_chunks_are_as_small_as_the_budget(monkeypatch):
+    scene = tc.Scene(**COMMON)
+    seen = []
+
+    def measure(chunk):
+        seen.extend((chunk.first, len(part.times)) for part in chunk.trajectories())
+        return {}
+
+    assert [first for first, _ in stream(scene, measure, "modes", memory_budget=1)] == [0, 1, 2, 3, 4]
+    assert seen == [(i, 1) for i in range(5) for _ in range(4)]
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_change_nothing(threads, small_scene, small_transfer):
+    torch.set_num_threads(threads)
+    try:
+        other = tc.band_transfer(small_scene, "modes")
+        assert torch.get_num_threads() == threads  # what the caller has set is set again
+    finally:
+        torch.set_num_threads(1)
+    for name in ("mean", "stderr", "long_time", "long_time_stderr", "block_mean"):
+        assert torch.allclose(getattr(other, name), getattr(small_transfer, name), rtol=0, atol=1e-13)
+
+
+def test_a_run_repeats_to_the_last_bit():
+    scene = tc.Scene(**COMMON)
+    assert equal(tc.simulate(scene, "modes"), tc.simulate(scene, "modes"))
+
+
+def test_more_realizations_begin_with_the_same_ones():
+    scene = tc.Scene(**COMMON)
+    five = tc.simulate(scene, "modes")["band_energy"].values
+    six = tc.simulate(replace(scene, realizations=6), "modes")["band_energy"].values
+    last = reference(scene, 5)["band_energy"]
+    np.testing.assert_allclose(6 * six - 5 * five, last, atol=1e-9)
+
+
+def test_one_realization_has_an_infinite_error():
+    data = tc.simulate(tc.Scene(**{**COMMON, "realizations": 1}), "modes")
+    for name in OBSERVABLES:
+        assert np.isposinf(data[f"{name}_stderr"].values).all()
+        assert np.isfinite(data[name].values).all()
+    one = tc.band_transfer(tc.Scene(**{**COMMON, "realizations": 1}), "modes")
+    assert torch.isposinf(one.stderr).all()
+    assert torch.isposinf(one.long_time_stderr).all()
+
+
+def test_an_ordered_scene_has_no_error_and_is_computed_once():
+    scene = tc.Scene(**{**COMMON, "realizations": 10**6}, disorder=tc.Disorder(strength=0.0))
+    data = tc.simulate(scene, "modes")
+    for name in OBSERVABLES:
+        assert not data[f"{name}_stderr"].values.any()
+    np.testing.assert_allclose(data["band_energy"].values, np.eye(4)[:, None].repeat(4, 1), atol=1e-12)
+    assert (data.attrs["mass_mean"], data.attrs["mass_sd"]) == (1.0, 0.0)
+
+
+def test_band_transfer_is_the_simulation_of_one_tone_a_band():
+    scene = tc.Scene(**{**COMMON, "observables": ("band_energy", "long_time_band_energy")})
+    data, transfer = tc.simulate(scene, "modes"), tc.band_transfer(scene, "modes")
+    assert transfer.mean.shape == transfer.stderr.shape == (4, 4, 4)
+    for ours, theirs in (
+        (transfer.mean, "band_energy"),
+        (transfer.stderr, "band_energy_stderr"),
+        (transfer.long_time, "long_time_band_energy"),
+        (transfer.long_time_stderr, "long_time_band_energy_stderr"),
+    ):
+        np.testing.assert_allclose(ours.numpy(), data[theirs].values, rtol=1e-12, atol=1e-15)
+    assert torch.equal(transfer.times, scene.times)
+    assert transfer.n_bands == 4
+    assert transfer.scene.tones == (1, 3, 5, 7)
+
+
+def test_band_transfer_conserves_energy(small_transfer):
+    # Standing waves have no net momentum, but k = 0 holds some of a disordered chain's energy (M v is not uniform).
+    rest = 1 - small_transfer.mean.sum(-1)
+    assert abs(rest[:, 0]).max() < 1e-14
+    assert abs(rest).max() < 0.05
+    starts = small_transfer.mean[:, 0]
+    assert torch.allclose(starts, torch.eye(4, dtype=torch.float64), atol=1e-13)
+
+
+def test_blocks(small_transfer):
+    counts = torch.tensor(small_transfer.block_counts, dtype=torch.float64)
+    assert counts.sum() == 12
+    weights = counts / counts.sum()
+    for blocks, whole in (
+        (small_transfer.block_mean, small_transfer.mean),
+        (small_transfer.block_long_time, small_transfer.long_time),
+    ):
+        assert torch.allclose(torch.einsum("b...,b->...", blocks, weights), whole, rtol=1e-12, atol=1e-15)
+    many = tc.band_transfer(tc.Scene(**{**COMMON, "realizations": 47}), "modes", long_time=False)
+    assert len(many.block_counts) == 20
+    assert sum(many.block_counts) == 47
+    assert {2, 3} == set(many.block_counts)
+
+
+@pytest.mark.parametrize("long_time", [True, False])
+def test_transfers_are_saved_and_read_back(long_time, tmp_path):
+    scene = tc.Scene(**{**COMMON, "times": [0.0, 0.3, 1.7]}, energy_definition="bond")
+    transfer = tc.band_transfer(scene, "modes", long_time)
+    assert (transfer.long_time is None) is (not long_time)
+    path = tmp_path / "transfer.nc"
+    transfer.to_dataset().to_netcdf(path, engine="h5netcdf")
+    with xarray.open_dataset(path, engine="h5netcdf") as data:
+        again = tc.BandTransfer.from_dataset(data)
+    assert again.scene.to_dict() == transfer.scene.to_dict()
+    assert again.block_counts == transfer.block_counts
+    assert again.attributes == transfer.attributes
+    for name in ("times", "mean", "stderr", "long_time", "long_time_stderr", "block_mean", "block_long_time"):
+        ours, theirs = getattr(transfer, name), getattr(again, name)
+        assert ours is theirs is None or torch.equal(ours, theirs)
+
+
+def test_source_and_receiver_are_not_exchanged(small_transfer):
+    # The ensemble's T is far from symmetric: a literal chain by chain mean tells row from column.
+    scene = small_transfer.scene
+    single = np.stack([reference(scene, i)["band_energy"][:, -1] for i in range(3)]).mean(0)
+    three = tc.band_transfer(replace(scene, realizations=3), "modes")
+    np.testing.assert_allclose(three.mean[:, -1].numpy(), single, atol=1e-10)
+    assert abs(single - single.T).max() > 0.01
+
+
+# Infinite-time shares [source, receiver] at the paper's case: the mean over 1200 chains drawn by NumPy's own generator
+# (normal, redrawn below 0.05) with scipy.linalg.eigh, np.fft and the sum over modes; standard errors below 0.4 %.
+KNOWN = {(23, 23): 0.1121, (23, 20): 0.0570, (20, 20): 0.1534, (20, 23): 0.0539, (10, 10): 0.563}
+
+
+def test_known_steady_states():
+    scene = tc.Scene(realizations=30, times=[0.0], seed=1)
+    transfer = tc.band_transfer(scene, "modes")
+    for (source, receiver), expected in KNOWN.items():
+        at = source - 1, receiver - 1
+        error = transfer.long_time_stderr[at].item()
+        assert abs(transfer.long_time[at].item() - expected) < 4 * error
+        assert error < 0.1 * expected  # else the line above would say little
+
+
+def test_stages_are_timed():
+    stages = Stages()
+    tc.band_transfer(tc.Scene(**COMMON), "modes", stages=stages)
+    assert {"masses", "eigen-decomposition", "evolution", "observables", "long-time average", "statistics"} <= set(
+        stages.seconds
+    )
+    assert all(seconds >= 0 for seconds in stages.seconds.values())
+
+
+BASE = tc.Scene(**COMMON)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (
+            lambda: tc.band_transfer(replace(BASE, excitation=tc.Impulse())),
+            FieldError,
+            "excitation must be standing waves for a band transfer, got Impulse",
+        ),
+        (
+            lambda: tc.band_transfer(replace(BASE, excitation=tc.StandingWave((1, 3, 5)))),
+            FieldError,
+            r"excitation.tones must lie one in each of the 4 bands, in order, got bands \[1, 2, 3\]",
+        ),
+        (
+            lambda: tc.band_transfer(replace(BASE, excitation=tc.StandingWave((1, 2, 5, 7)))),
+            FieldError,
+            "excitation.tones must lie one in each of the 4 bands",
+        ),
+        (
+            lambda: tc.band_transfer(replace(BASE, excitation=tc.StandingWave((3, 1, 5, 7)))),
+            FieldError,
+            "excitation.tones must lie one in each of the 4 bands, in order",
+        ),
+        (lambda: tc.simulate(BASE, "mode"), FieldError, "method must be one of .*, got 'mode'"),
+        (lambda: tc.simulate(BASE, None), FieldTypeError, "method must be a string"),
+        (lambda: tc.simulate(BASE, "modes", memory_budget=0), FieldError, "memory_budget must be at least 1"),
+        (lambda: tc.simulate(BASE, "modes", memory_budget=1.5), FieldTypeError, "memory_budget must be an integer"),
+        (lambda: tc.simulate(BASE, "modes", options={"foo": 1}), FieldError, "options of method 'modes' must have"),
+        (
+            lambda: tc.simulate(replace(BASE, damping=0.1, observables=("energy",)), "modes"),
+            FieldError,
+            "damping must be zero",
+        ),
+        (
+            lambda: tc.simulate(replace(BASE, contact="hertz", observables=("energy",)), "modes"),
+            FieldError,
+            "contact must be linear for method 'modes'",
+        ),
+    ],
+)
+def test_bad_arguments(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

@@ -1,0 +1,172 @@
+"""The figure scripts: every one runs, leaves its files, redraws without a run, and says in one line what is wrong."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import sys
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "experiments"))
+
+import fig09
+import fig12
+import fig14
+import harness
+import run_all
+
+FILES = ("config.toml", "results.nc", "figure.png", "report.txt", "run.json")
+SCRIPTS = {
+    name: module.SCRIPT
+    for name, module in ((name, importlib.import_module(name)) for name in run_all.names())
+    if hasattr(module, "SCRIPT")
+}
+
+
+@pytest.fixture(scope="module", params=SCRIPTS)
+def done(request, tmp_path_factory):
+    """A script and the folder of its smoke run."""
+    name = request.param
+    out = tmp_path_factory.mktemp("experiments") / name
+    good, line = run_all.run_one(name, ["--smoke", "--out", str(out)])
+    assert good, line
+    return SCRIPTS[name], out
+
+
+def table(out: Path) -> xarray.Dataset:
+    with xarray.open_dataset(out / "results.nc", engine="h5netcdf") as data:
+        return data.load()
+
+
+def test_smoke_run_leaves_its_files(done):
+    script, out = done
+    assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
+    assert (out / "figure.png").read_bytes().startswith(b"\x89PNG")
+    config = tomllib.loads((out / "config.toml").read_text())
+    record = json.loads((out / "run.json").read_text())
+    assert record["command"].startswith(f"python experiments/{script.name}.py --smoke")
+    assert record["seed"] == config["seed"] == script.smoke.seed
+    assert {"versions", "device", "threads", "seconds", "config_sha256"} <= record.keys()
+
+
+def test_table_is_printed_and_saved(done):
+    _, out = done
+    data, report = table(out), (out / "report.txt").read_text()
+    assert data.sizes["row"] >= 1
+    assert np.isfinite(data.row_measured.values).all()
+    for quantity, measured in zip(data.row_quantity.values, data.row_measured.values, strict=True):
+        assert quantity in report
+        assert f"{measured:.4g}" in report
+    assert len(report.splitlines()) > data.sizes["row"] + 2, "words below the table"
+
+
+def test_redraw_runs_nothing(done):
+    script, out = done
+    report, before = (out / "report.txt").read_text(), {name: (out / name).stat().st_mtime_ns for name in FILES}
+    (out / "figure.png").unlink()
+
+    def refuse(*_):
+        raise AssertionError("a redraw must not measure")
+
+    assert harness.run(replace(script, measure=refuse), ["--redraw", "--out", str(out)]) == 0
+    assert (out / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "report.txt").read_text() == report
+    for name in ("config.toml", "results.nc", "run.json"):
+        assert (out / name).stat().st_mtime_ns == before[name]
+
+
+@pytest.mark.parametrize(
+    ("config", "flags", "words"),
+    [
+        ("relizations = 3", [], "relizations"),
+        ("seed = 'many'", [], "seed"),
+        ("seed = [", [], "TOML"),
+        ("n_particles = 255", ["--smoke"], "n_particles must be even"),
+        ("", ["--realizations", "0"], "realizations must be at least 1, got 0"),
+        ("", ["--no-such-flag"], "no-such-flag"),
+        ("", ["--smoke", "--device", "abacus"], "device must be available here"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, capsys, config, flags, words):
+    file, out = tmp_path / "config.toml", tmp_path / "out"
+    file.write_text(config)
+    assert fig12.main(["--config", str(file), "--out", str(out), *flags]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("fig12: error: ")
+    assert words in error
+    assert error.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_unknown_config_key(name, tmp_path, capsys):
+    file = tmp_path / "config.toml"
+    file.write_text("no_such_key = 1")
+    assert harness.run(SCRIPTS[name], ["--config", str(file), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "no_such_key" in error
+    assert error.count("\n") == 1
+
+
+def test_flags_override_config_overrides_smoke(tmp_path):
+    file, out = tmp_path / "config.toml", tmp_path / "out"
+    file.write_text("seed = 3\nrealizations = 2\n")
+    assert fig12.main(["--smoke", "--config", str(file), "--seed", "5", "--out", str(out)]) == 0
+    saved = tomllib.loads((out / "config.toml").read_text())
+    assert (saved["seed"], saved["realizations"], saved["stop"]) == (5, 2, fig12.SMOKE.stop)
+    assert fig12.main(["--config", str(out / "config.toml"), "--out", str(tmp_path / "again")]) == 0
+    assert table(tmp_path / "again").equals(table(out)), "the saved config makes the same data again"
+
+
+def test_redraw_keeps_the_settings(tmp_path, capsys):
+    out = ["--out", str(tmp_path / "out")]
+    assert fig12.main(["--redraw", *out]) == 2
+    assert "config" in capsys.readouterr().err
+    assert fig12.main(["--smoke", *out]) == 0
+    capsys.readouterr()
+    assert fig12.main(["--redraw", "--seed", "7", *out]) == 2
+    assert "seed must stay 0" in capsys.readouterr().err
+
+
+def test_run_all_reports_a_failure(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(run_all, "names", lambda: ["fig12", "no_such_script"])
+    assert run_all.main(["--smoke", "--out", str(tmp_path)]) == 1
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("ok     fig12")
+    assert second.startswith("FAILED no_such_script")
+    assert (tmp_path / "fig12" / "figure.png").is_file()
+
+
+def test_jackknife_of_a_mean_is_its_standard_error():
+    blocks = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    value, error = harness.jackknife(blocks, [5] * 20, lambda mean: mean)
+    torch.testing.assert_close(value, blocks.mean(0))
+    torch.testing.assert_close(error, blocks.std(0) / 20**0.5)
+    assert harness.jackknife(blocks[:1], [5], lambda mean: mean)[1].isnan().all()
+
+
+def test_sigmas_count_both_ensembles_and_the_paper_s_rounding():
+    assert harness.Row("", 0.12, 0.01, "0.10").sigmas == pytest.approx(0.02 / math.sqrt(2e-4 + 1e-4 / 12))
+    assert math.isnan(harness.Row("", 0.12, 0.01).sigmas)
+
+
+def test_rates_of_fig_14_are_the_paper_s():
+    config = fig14.Config(realizations=40, stop=5.0, fit_steps=(0.25,), late=(50.0,))
+    rows = [row for row in fig14.compare(fig14.measure(config, "cpu"), config) if "  L, dt = 0.25" in row.quantity]
+    assert [row.paper for row in rows] == ["-0.18", "0.0079"]
+    assert all(abs(row.sigmas) < 4 for row in rows)
+
+
+def test_eq_28_as_printed_is_what_puts_the_energy_on_light_particles():
+    data = fig09.measure(replace(fig09.SMOKE, stop=256.0), "cpu")
+    light = data.light_among_top.mean("realization")
+    assert float(light.sel(case="Eq. 26")) <= 1
+    assert float(light.sel(case="Eq. 28 as printed")) >= 3
