@@ -144,6 +144,8 @@ def _costs(ax: Axes, data: xarray.Dataset) -> None:
     ax.legend(handles=handles, fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
     ax.set(xlabel="seconds of the fit / seconds of the ensemble", ylabel="total variation from fresh chains",
            xscale="log", yscale="log", title="(b) error and cost")  # fmt: skip
+    for label in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+        label("{x:g}")
 
 
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:
@@ -172,15 +174,23 @@ def explain(data: xarray.Dataset, config: Config) -> str:
         "own: from the chains of the fit;\nenergy - 1: of the source that is furthest off; "
         f"cost: seconds over the {data.ensemble_seconds:.1f} s of the ensemble.",
         f"Nearest to fresh chains: {names[best]}, {float(data.fresh[best]):.4f} where two ensembles differ by {data.noise:.4f}.",
-        "What stays behind matters more than how Q is fitted: with the exact shares of all pairs (basis_matrix) even Eq. 50 beats\n"
-        "the best fit of Q with Psi. Its exact diagonal alone (exact_psi) helps the short-time fits little and Adam not at all.",
+        "What stays behind matters more than how Q is fitted. Best of every model: "
+        + ", ".join(f"{model} {float(part.min()):.4f}" for model, part in data.fresh.groupby(data.model))
+        + f";\nwith Eq. 50 for Q: {_analytic(data)}.",
     ]
     if growing:
         lines.append(
             f"Unstable: {', '.join(growing)}. A row sum of Q above zero makes energy, and it grows exponentially."
         )
-    lines += [f"{name}: {text}" for name, text in zip(names, data.warning.values, strict=True) if text]
+    lines += dict.fromkeys(
+        f"{m}: {text}" for m, text in zip(data.method.values, data.warning.values, strict=True) if text
+    )
     return "\n".join(lines)
+
+
+def _analytic(data: xarray.Dataset) -> str:
+    part = data.isel(fit=data.method.values == "analytic")
+    return ", ".join(f"{m} {f:.4f}" for m, f in zip(part.model.values, part.fresh.values, strict=True))
 
 
 SCRIPT = harness.Script("calibration_methods", Config(), SMOKE, measure, draw, compare, explain)

@@ -28,9 +28,11 @@ class Config(Ensemble):
     stop: float = 512.0
     step: float = 1.0
     tone: int = 1
+    """of the standing wave"""
     strength: float = 0.3
     """disorder xi"""
     amplitude: float = 0.01
+    """of the standing wave, in initial overlaps"""
     lightest: int = 10
     """the particles that count as the lightest"""
 
@@ -131,7 +133,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
         "The paper sees the largest displacements and energies at the lightest particles. With S^-1 = S^T M (Eq. 26) it is\n"
         "the other way round: a wave this long is almost a mode, all neighbors move alike, and the heavy particles carry\n"
         "the kinetic energy. Eq. 28 as printed drops the mass: it starts from u_0 / b, plucks the lightest particles by\n"
-        "1 / b, and leaves their energy in modes localized there. That is what the paper describes."
+        "1 / b, and leaves their energy in modes localized there: of the two starts, the one that gives what the paper describes."
     )
     return "\n".join(lines)
 

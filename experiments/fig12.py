@@ -21,6 +21,7 @@ class Config(Ensemble):
     strength: float = 0.3
     """disorder xi"""
     tone: int = 90
+    """of the standing wave"""
 
 
 SMOKE = Config(realizations=4, stop=5.0)

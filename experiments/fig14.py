@@ -212,8 +212,9 @@ def explain(data: xarray.Dataset, config: Config) -> str:
     return (
         "L: the paper's rates come out with dt = 0.25 (a window from 0.5 to 2). With dt = 1 as printed (2 to 8) the line lies in\n"
         "the saturating part and the decay comes out half as fast. NL: Section 3.5 defines the rate at t0 and takes it at 2 t0\n"
-        "or 3 t0, which is a matter of tens of percent. The paper's rates are those at 1 to 2 t0 with dt = 0.25, and those at 2\n"
-        "to 3 t0 with dt = 1: NL does not tell the two readings apart, L does.\n"
+        "or 3 t0, which is a matter of tens of percent. The decay passes the paper's rates between t0 and 3 t0 with dt = 0.25,\n"
+        "and between 2 t0 and 3 t0 with dt = 1, where the rise at 3 t0 is still some 10 % fast: NL does not tell the two\n"
+        "readings apart, L does.\n"
         "Steady states: the paper's are those before t = 50, except the 0.04 of band 23 from band 20, which no time gives here.\n"
         "The source's own share rises on from there: its exact average over infinite time is higher by several standard errors,\n"
         "where the paper finds no further transfer up to t = 5000. k_ins: tone n has k = 2 pi n / (N + 1); the paper's numbers\n"

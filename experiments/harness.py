@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import io
 import math
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -138,7 +139,7 @@ def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
             "report.txt": outputs.text(report),
             "run.json": outputs.run_record(
                 arguments, config, flags.device, began, stages,
-                command=" ".join(["python", f"experiments/{script.name}.py", *arguments]), seed=flags.settings.seed,
+                command=shlex.join(["python", f"experiments/{script.name}.py", *arguments]), seed=flags.settings.seed,
             ),
         },
     )  # fmt: skip
@@ -177,15 +178,19 @@ def _read(script: Script, arguments: list[str]) -> Any:
 
 
 def _parse(script: Script, settings: Any, arguments: list[str]) -> Any:
+    def flag(default: Any, words: str) -> Any:
+        return dataclasses.field(default=default, metadata={"help": words})
+
+    switch = tyro.conf.FlagCreatePairsOff[bool]
     kind = dataclasses.make_dataclass(
         "Flags",
         [
             ("settings", tyro.conf.OmitArgPrefixes[type(settings)], settings),
-            ("config", str | None, dataclasses.field(default=None, metadata={"help": "settings in a TOML file"})),
-            ("out", str, f"results/experiments/{script.name}"),
-            ("device", str, "cpu"),
-            ("smoke", tyro.conf.FlagCreatePairsOff[bool], False),
-            ("redraw", tyro.conf.FlagCreatePairsOff[bool], False),
+            ("config", str | None, flag(None, "settings in a TOML file")),
+            ("out", str, flag(f"results/experiments/{script.name}", "folder of the run")),
+            ("device", str, flag("cpu", "cpu, cuda, cuda:1, ...")),
+            ("smoke", switch, flag(False, "few chains and short times: seconds")),
+            ("redraw", switch, flag(False, "figure and table from the data saved in --out, no run")),
         ],
         frozen=True,
     )

@@ -20,7 +20,6 @@ from torchchain.bands import band_of
 from torchchain.chain import Chain
 from torchchain.energy import energy_center, energy_width, particle_energy, total_energy
 from torchchain.evolvers import METHODS, Trajectory, fused, start
-from torchchain.evolvers.fused import energy_moments
 from torchchain.evolvers.linearity import elongation_estimate, warn_if_nonlinear
 from torchchain.excitation import Impulse, StandingWave, State
 from torchchain.scene import Scene
@@ -133,25 +132,17 @@ class Chunk:
         """The named observables at all times, (realization, [tone,] *axes)."""
         if not names:
             return {}
-        if self.method == "chebyshev" and planning.MOMENTS.issuperset(names):
+        if _is_fused(self.method, names):
+            given = (self.chain, self.state, self.times)
+            definition = self.scene.energy_definition
             with self.stages("evolution with observables"):
-                moments = energy_moments(
-                    self.chain, self.state, self.times, self.scene.energy_definition, **self.options
-                )
+                if "band_energy" in names:
+                    return {
+                        "band_energy": fused.band_energy(*given, self.scene.n_bands, True, definition, **self.options)
+                    }
+                moments = fused.energy_moments(*given, definition, **self.options)
             every = {"total_energy": moments.total, "center": moments.center, "width": moments.width}
             return {name: every[name] for name in names}
-        if self.method == "chebyshev" and set(names) == {"band_energy"}:
-            with self.stages("evolution with observables"):
-                bands = fused.band_energy(
-                    self.chain,
-                    self.state,
-                    self.times,
-                    self.scene.n_bands,
-                    True,
-                    self.scene.energy_definition,
-                    **self.options,
-                )
-            return {"band_energy": bands}
         parts: dict[str, list[Tensor]] = {name: [] for name in names}
         for trajectory in self.trajectories():
             with self.stages("observables"):
@@ -205,16 +196,11 @@ def stream(
         plan = planning.plan(scene)
         method, options = plan.method, {**plan.options, **options}
     stages = stages or Stages()
-    on_cpu = device.type == "cpu"
-    workers = torch.get_num_threads() if on_cpu and not METHODS[method].threaded else 1
-    budget = checks.integer("memory_budget", memory_budget, 1) // workers
     check_amplitude(scene)
-    state_bytes = 8 * max(1, len(scene.tones)) * scene.n_particles * 10  # states, phases, transforms, products
-    mode_bytes = 8 * scene.n_particles**2 * 8 if method == "modes" else 0
+    budget = checks.integer("memory_budget", memory_budget, 1)
     realizations = 1 if scene.is_ordered else scene.realizations
-    window = max(1, min(len(scene.times), min(budget - mode_bytes, CACHE_FRIENDLY) // state_bytes))
-    size = max(1, min(budget, mode_bytes + CACHE_FRIENDLY) // (mode_bytes + state_bytes * window))
-    size = min(size, -(-realizations // workers))
+    workers = min(torch.get_num_threads(), realizations) if device.type == "cpu" else 1
+    window, size = _chunking(scene, method, realizations, workers, budget // workers)
     times = scene.times.to(device)
 
     def work(numbers: range) -> tuple[range, dict[str, Tensor], dict[str, float]]:
@@ -233,6 +219,25 @@ def stream(
             stages.add(seconds)
             yield numbers[0], measured
             bar.update(len(numbers))
+
+
+def _chunking(scene: Scene, method: str, realizations: int, workers: int, budget: int) -> tuple[int, int]:
+    """Times per window and realizations per chunk that keep one worker's chunk within a budget of bytes."""
+    rows = max(1, len(scene.tones))
+    share = -(-realizations // workers)
+    if _is_fused(method, scene.observables):  # no states are stored: a few chunks a worker, for the progress bar
+        return len(scene.times), max(1, min(-(-share // 4), budget // (8 * rows * 12 * scene.n_particles)))
+    state_bytes = 8 * rows * scene.n_particles * 10  # states, phases, transforms, products
+    mode_bytes = 8 * scene.n_particles**2 * 8 if method == "modes" else 0
+    window = max(1, min(len(scene.times), min(budget - mode_bytes, CACHE_FRIENDLY) // state_bytes))
+    size = max(1, min(budget, mode_bytes + CACHE_FRIENDLY) // (mode_bytes + state_bytes * window))
+    return window, min(size, share)
+
+
+def _is_fused(method: str, names: Sequence[str]) -> bool:
+    """Whether the stencil's kernels measure the observables without storing states."""
+    in_time = [name for name in names if name in IN_TIME]
+    return method == "chebyshev" and (planning.MOMENTS.issuperset(in_time) or in_time == ["band_energy"])
 
 
 def check_amplitude(scene: Scene) -> None:

@@ -187,7 +187,7 @@ def _choice(name: str, scene: Scene, facts: _Facts, tolerance: float, machine: M
         seconds = 60 * machine.decomposition * facts.n**3 + 8 * points * facts.n * machine.flop + points * machine.entry
         return Choice(name, options, EPS * (400 + 40 * phase), chains * seconds)
     if name == "chebyshev":
-        accuracy = min(1e-3, max(1e-13, tolerance / 10))
+        accuracy = max(1e-13, min(1e-10, tolerance / 10))  # coarser saves next to nothing
         step = phase / max(1, facts.count - 1)
         work = facts.touched * points * chebyshev_work(step, accuracy) if facts.count > 1 else 0.0
         work = max(work, facts.touched * facts.rows * facts.n * phase)

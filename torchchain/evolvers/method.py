@@ -43,8 +43,7 @@ class Method:
     """One way to evolve a chain: the registry's entry, which tests, charts, the plan and the manual iterate over.
 
     ``start(chain, state, **options)`` checks its arguments and does what is done once; the function it returns
-    is called with increasing windows of times. ``threaded`` methods use all cores for one batch on the CPU; the
-    others leave it to the caller to run batches side by side.
+    is called with increasing windows of times.
     """
 
     name: str
@@ -58,7 +57,6 @@ class Method:
     boundaries: tuple[str, ...] = ("periodic", "fixed")
     contacts: tuple[str, ...] = ("linear",)
     damped: bool = False
-    threaded: bool = False
     options: dict[str, str] = field(default_factory=dict)
 
 

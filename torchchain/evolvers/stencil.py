@@ -54,8 +54,8 @@ _SLACK = 8.9e-16  # times closer than this, relative to themselves, count as equ
 _PAD = 8  # cells on either side of a row: at least one, kept at 64 bytes for alignment
 _RING = 6  # rows of T_k alive at a time: four that are summed together and the two before them
 
-_kernel = njit(nogil=True, cache=True, fastmath={"contract"})
-_summing_kernel = njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+_kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+_summing_kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
 
 # Rows of the scratch are reached as offsets into one flat array, and indices are unsigned: signed ones make Numba
@@ -397,28 +397,30 @@ def _record_moments(w, row, u, v, kind, low, high, reference, out):
 @_kernel
 def _record_fields(w, row, u, v, kind, out, r, i):
     """Leaves one state, or the fields that make up its energy in wavenumber space, in out[:, r, i]."""
+    # One field a loop: with more pointers in one, the compiler gives up proving that they are apart.
     n, one = _U(row.n), _U(1)
     p, s, b, k = _U(u), _U(v), _U(row.mass), _U(row.contact)
     first, second = out[0, r, i], out[1, r, i]
-    if kind == STATES:
-        for q in range(n):
-            first[q] = w[p + q]
-            second[q] = w[s + q]
-    elif kind == BOND_FIELDS:
+    if kind == BOND_FIELDS:
         for q in range(n):
             first[q] = math.sqrt(w[b + q]) * w[s + q]
-            second[q] = math.sqrt(w[k + q]) * (w[p + q] - w[p + q - one])
-    else:
-        third = out[2, r, i]
         for q in range(n):
-            first[q] = w[s + q]
+            second[q] = math.sqrt(w[k + q]) * (w[p + q] - w[p + q - one])
+        return
+    velocity = second if kind == STATES else first
+    displacement = first if kind == STATES else out[2, r, i]
+    for q in range(n):
+        velocity[q] = w[s + q]
+    for q in range(n):
+        displacement[q] = w[p + q]
+    if kind != STATES:
+        for q in range(n):
             second[q] = w[b + q] * w[s + q]
-            third[q] = w[p + q]
-        if kind == SITE_FIELDS:
-            fourth = out[3, r, i]
-            for q in range(n):
-                x = w[p + q]
-                fourth[q] = w[k + q] * (x - w[p + q - one]) + w[k + q + one] * (x - w[p + q + one])
+    if kind == SITE_FIELDS:
+        pull = out[3, r, i]
+        for q in range(n):
+            x = w[p + q]
+            pull[q] = w[k + q] * (x - w[p + q - one]) + w[k + q + one] * (x - w[p + q + one])
 
 
 class Tables(NamedTuple):
