@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchchain as tc
-from torchchain import ensemble, plots
+from torchchain import checks, ensemble, plots
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,8 @@ def mean_and_error(values: Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure(config: Config, device: str) -> xarray.Dataset:
+    if len(config.times) < 2:
+        raise checks.fail("times", "hold at least two instants to compare", config.times)
     energies = [
         each_realization(config.scene(xi, config.times, ("energy",)), config.method, device)["energy"]
         / config.initial_energy
@@ -138,15 +140,16 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
             )
             if xi == 0:
                 near = particle < 0.995 * t
-                ax.plot(particle[near], group_velocities(t, particle[near]), "k--", lw=0.8,
-                        label="group velocities" if j == 0 else None)  # fmt: skip
+                ax.plot(particle[near], group_velocities(t, particle[near]), "k--", lw=0.8)
             front = front_of(data, i, j)
             ax.plot(front[0], front[1], "kv", ms=4, mfc="none")
+        if xi == 0:
+            ax.plot([], [], "k--", lw=0.8, label="group velocities")
         ax.set(xlabel="particle p", ylabel="mean energy / energy of the kick", yscale="log", title=f"$\\xi$ = {xi:g}")
         ax.set(xlim=(-0.02 * config.n_particles, config.n_particles), ylim=(1e-6, 2 * float(data.energy.max())))
-        ax.legend(fontsize="small")
+        ax.legend(fontsize="small", loc="upper right")
     figure.suptitle(
-        f"kick at particle {config.site}, {config.realizations} chains; triangles: the coherent front",
+        f"kick at particle {config.site}, {config.realizations} chains, shaded: standard error; triangles: the coherent front",
         fontsize="medium",
     )
     return figure
@@ -192,7 +195,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
             continue
         lines.append(
             f"xi = {xi:g}: two peaks at every instant shown, at the source and at the front; at t = {config.times[-1]:g} they stand "
-            f"{source / valley:.1f} and {height / valley:.1f} times above the valley between them.\n"
+            f"{source / valley:.3g} and {height / valley:.3g} times above the valley between them.\n"
             f"  Behind the front the curves fall on one another: {100 * float(data.kept[i]):.1f} % of the energy in p <= {behind(config)} "
             f"at t = {config.times[-2]:g} is still there at t = {config.times[-1]:g}."
         )  # fmt: skip

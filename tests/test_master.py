@@ -123,7 +123,7 @@ def test_every_solver(method):
         elif method in FIXED:  # four-step Adams methods, started by lower orders
             allowed = 20 * (2 * 0.02) ** 2
         elif method in ADAPTIVE:
-            allowed = 1e-6  # rtol is 1e-8 a step
+            allowed = 1e-8 if ORDERS[method] >= 5 else 2e-5  # a few dozen steps with rtol 1e-8, thousands with 1e-6
         else:
             allowed = {"expm": 1e-13, "scipy_solver": 1e-6}[method]
         np.testing.assert_allclose(solved, expected, rtol=0, atol=allowed)
@@ -269,7 +269,7 @@ def test_memory_model(damped):
     d = np.zeros(4) if damping is None else damping.numpy()
     for solved in (
         model.transfer(torch.from_numpy(times)).numpy(),
-        tc.MasterEquation(model, None).solve(np.eye(4), times, "dopri8", rtol=1e-10, atol=1e-12).numpy(),
+        tc.MasterEquation(model, None).solve(np.eye(4), times, "dopri8").numpy(),
     ):
         for i, t in enumerate(times):
             expected = model.basis.numpy() + a[0] * np.exp(-0.5 * t) + a[1] * np.exp(-0.05 * t)
@@ -319,7 +319,7 @@ EXPLODING = master(np.diag(np.full(B, 1.0)), np.zeros(B))
         ((np.eye(B), [1.0], "scipy_solver"), {"solver": "x"}, FieldError, "solver must be one of RK45"),
         ((np.eye(B), [1.0], "dopri5"), {"rtol": 1e-300, "atol": 1e-300}, IntegrationError, "must reach time 1 with rtol"),
         (([1e308] * B, [1.0]), {}, None, ""),
-        ((np.eye(B), [1e300]), {}, IntegrationError, r"solver 'expm' must stay finite, got overflow up to time 1e\+300"),
+        ((np.eye(B), [1e300]), {}, FieldError, "times must be at most .*, where rounding blurs these rates"),
     ],
 )
 def test_bad_requests(arguments, options, error, message):
@@ -330,10 +330,28 @@ def test_bad_requests(arguments, options, error, message):
         MODEL.solve(*arguments, **options)
 
 
-@pytest.mark.parametrize("method", ["expm", "dopri5", "rk4"])
+@pytest.mark.parametrize("method", ["expm", "dopri8", "rk4"])
 def test_growth_beyond_all_numbers_is_an_error(method):
     with pytest.raises(IntegrationError, match=f"solver '{method}' must"):
-        EXPLODING.solve(np.eye(B), [0.0, 1.0, 2e3], method)
+        EXPLODING.solve(np.eye(B), [0.0, 1.0, 800.0], method)
+
+
+def test_the_latest_time_of_the_matrix_exponential():
+    rates = conserving_rates()
+    latest = 1e9 / abs(rates).sum(1).max()
+    stationary = np.abs(scipy.linalg.null_space(rates.T)[:, 0])
+    late = master(rates, np.zeros(B)).solve(np.eye(B), [0.999 * latest])[:, 0].detach().numpy()
+    np.testing.assert_allclose(late, np.tile(stationary / stationary.sum(), (B, 1)), atol=1e-6)
+    with pytest.raises(FieldError, match="times must be at most"):
+        master(rates, np.zeros(B)).solve(np.eye(B), [1.001 * latest])
+
+
+def test_an_output_time_costs_no_accuracy():
+    # The dense output of dopri8 between its steps is of order 4 only: steps end at the output times.
+    model = master(conserving_rates(), np.zeros(B))
+    times = np.linspace(0, 30, 50)
+    error = (model.solve(np.eye(B), times, "dopri8") - model.solve(np.eye(B), times)).abs().max().item()
+    assert error < 1e-9
 
 
 EYE = torch.eye(3, dtype=torch.float64)

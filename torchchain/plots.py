@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -100,4 +101,16 @@ def distance_curve(ax: Axes, times: np.ndarray, distance: np.ndarray, statistica
     curve(ax, times, statistical.mean(0), label="two ensembles of this size", color="k", linestyle=":")
     ax.set(xlabel=TIME_LABEL, ylabel="total variation", title=title, ylim=(0, None))
     ax.legend(fontsize="small")
+    return ax
+
+
+def exponents(ax: Axes, x: np.ndarray, fits: Sequence[Any], xlabel: str) -> Axes:
+    """Exponents of power laws with error bars, and the slopes in both halves of each one's window.
+
+    Each fit has ``exponent``, ``stderr``, ``lower`` and ``upper``.
+    """
+    ax.errorbar(x, [fit.exponent for fit in fits], [fit.stderr for fit in fits], fmt="ko-", capsize=3, label="whole window")
+    ax.plot(x, [fit.lower for fit in fits], "v", color="C0", mfc="none", label="lower half")
+    ax.plot(x, [fit.upper for fit in fits], "^", color="C3", mfc="none", label="upper half")
+    ax.set(xlabel=xlabel, ylabel="exponent")
     return ax

@@ -55,6 +55,9 @@ class MemoryModel(TransferModel):
             checks.real_tensor(name, value).to(rates)
             for name, value in (("decay", decay), ("pair_decay", pair_decay), ("pair_frequency", pair_frequency))
         )
+        for name, value in (("decay", decay), ("pair_decay", pair_decay), ("pair_frequency", pair_frequency)):
+            if value.ndim != 1:
+                raise checks.fail(name, "be one-dimensional", f"shape {tuple(value.shape)}")
         for name, value in (("decay", decay), ("pair_decay", pair_decay)):
             checks.first_bad(name, "not be negative", value, value < 0, "function")
         shape = (len(decay) + 2 * len(pair_decay), *rates.shape)

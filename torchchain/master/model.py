@@ -10,6 +10,10 @@ from torch import Tensor, nn
 from torchchain import checks
 
 
+LONGEST_FLOW = 1e9
+"""Largest rate times time for the matrix exponential, whose rounding grows with it: 1e-7 or so there, all digits at 1e16."""
+
+
 @dataclass(frozen=True, eq=False)
 class Embedding:
     """A model as a linear differential equation: y(0) = e(0) start, dy/dt = y generator, e = y readout.
@@ -65,9 +69,9 @@ class TransferModel(nn.Module):
 
 def checked_basis(basis: Tensor, rates: Tensor) -> Tensor:
     """Pi [source, receiver] from itself or its diagonal, checked against the rates."""
-    n = len(rates)
-    if rates.ndim != 2 or rates.shape[1] != n or not n:
+    if rates.ndim != 2 or rates.shape[0] != rates.shape[1] or not rates.numel():
         raise checks.fail("rates", "be a square matrix", f"shape {tuple(rates.shape)}")
+    n = len(rates)
     basis = checks.real_tensor("basis", basis)
     basis = torch.diag(basis) if basis.ndim == 1 else basis
     if tuple(basis.shape) != (n, n):
@@ -149,6 +153,9 @@ def flows(start: Tensor, generator: Tensor, times: Tensor) -> Tensor:
     On a regular grid one matrix exponential, its squares, and products that double the number of times each;
     else one exponential per time.
     """
+    latest = LONGEST_FLOW / max(float(generator.detach().abs().sum(-1).max()), 1e-300)
+    if float(times[-1]) > latest:
+        raise checks.fail("times", f"be at most {latest:.3g}, where rounding blurs these rates", float(times[-1]))
     count = len(times)
     step = (times[-1] - times[0]) / max(1, count - 1)
     regular = times[0] + step * torch.arange(count, dtype=times.dtype, device=times.device)
