@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import harness
 import numpy as np
@@ -102,7 +103,9 @@ def _slope(x: Tensor, y: Tensor) -> Tensor:
 
 def stored(fits: Sequence[PowerLaw], axis: str) -> dict[str, tuple[tuple[str, str], np.ndarray]]:
     """Fits as a variable of a dataset; :func:`restored` reads them back."""
-    table = [[*fit.window, fit.exponent, fit.stderr, fit.amplitude, fit.lower, fit.upper, fit.halves_stderr] for fit in fits]
+    table = [
+        [*fit.window, fit.exponent, fit.stderr, fit.amplitude, fit.lower, fit.upper, fit.halves_stderr] for fit in fits
+    ]
     return {"fit": ((axis, "fit_number"), np.array(table))}
 
 
@@ -135,7 +138,11 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     axes, units = ("strength", "particle"), {"units": "energy of the kick"}
     return xarray.Dataset(
         {
-            "energy": (axes, np.array(means), units | {"long_name": f"mean energy per particle at t = {config.time:g}"}),
+            "energy": (
+                axes,
+                np.array(means),
+                units | {"long_name": f"mean energy per particle at t = {config.time:g}"},
+            ),
             "energy_stderr": (axes, np.array(errors), units),
             **stored(fits, "strength"),
         },
@@ -160,7 +167,9 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     plots.exponents(right, np.array(config.strengths), fits, "disorder $\\xi$")
     right.axhline(-2.5, color="k", lw=0.8, ls=":", label="infinite chain, infinite time: $-5/2$")
     right.legend(fontsize="small")
-    figure.suptitle(f"kick at particle {config.site}, t = {config.time:g}, {config.realizations} chains", fontsize="medium")
+    figure.suptitle(
+        f"kick at particle {config.site}, t = {config.time:g}, {config.realizations} chains", fontsize="medium"
+    )
     return figure
 
 
@@ -173,7 +182,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
     fits = restored(data)
     bent = [f"{xi:g}" for xi, fit in zip(config.strengths, fits, strict=True) if fit.bends]
     which = "every xi" if len(bent) == len(fits) else f"xi = {', '.join(bent) or 'none'}"
-    order = "falls faster" if all(a.exponent > b.exponent for a, b in zip(fits, fits[1:], strict=False)) else "does not always fall faster"
+    order = "falls faster" if all(a.exponent > b.exponent for a, b in pairwise(fits)) else "does not always fall faster"
     return (
         f"The energy {order} with distance the stronger the disorder, as the paper says. No single power law holds, though: for {which}\n"
         "the slopes of the two halves of the window differ by more than three standard errors. It is a finite-time crossover: waves with\n"

@@ -96,7 +96,13 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
                        color="k" if main else f"C{j}", mfc="none", label=f"t = {late:g}, exponent {fit.exponent:.2f} $\\pm$ {fit.stderr:.2f}")  # fmt: skip
         if main:
             right.plot(strengths, fit(strengths), "k--", lw=0.8, label=f"power law at t = {late:g}")
-    right.set(xlabel="disorder $\\xi$", ylabel="mean energy left / energy of the kick", xscale="log", yscale="log", title="(b)")
+    right.set(
+        xlabel="disorder $\\xi$",
+        ylabel="mean energy left / energy of the kick",
+        xscale="log",
+        yscale="log",
+        title="(b)",
+    )
     right.set_xticks(strengths, [f"{xi:g}" for xi in strengths])
     right.set_xticks([], minor=True)
     right.legend(fontsize="small")
@@ -109,7 +115,9 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
     for j, (late, fit) in enumerate(zip(config.late, restored(data), strict=True)):
         for i, xi in enumerate(config.strengths):
             part = data.isel(strength=i, late=j)
-            rows.append(Row(f"t = {late:g}, xi = {xi:g}: energy left", float(part.residual), float(part.residual_stderr)))
+            rows.append(
+                Row(f"t = {late:g}, xi = {xi:g}: energy left", float(part.residual), float(part.residual_stderr))
+            )
         rows += fit.rows(f"t = {late:g}: energy left ~ xi^a")[:1]
     return rows
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass
+from itertools import pairwise
 
 import harness
 import numpy as np
 import xarray
 from fig02 import Kick, each_realization, mean_and_error
-from fig04 import power_law, restored, stored
+from fig04 import power_law, stored
 from harness import Row
 from matplotlib.figure import Figure
 
@@ -63,15 +64,24 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     for i, xi in enumerate(config.strengths):
         part = data.isel(strength=i)
         plots.curve(ax, times, part.center.values, part.center_stderr.values, label=f"$\\xi$ = {xi:g}", color=f"C{i}")
-        plots.curve(inset, times[early], part.center.values[early], part.center_stderr.values[early], color=f"C{i}", lw=0.9)
+        plots.curve(
+            inset, times[early], part.center.values[early], part.center_stderr.values[early], color=f"C{i}", lw=0.9
+        )
     ax.plot(times, BALLISTIC * times, "k:", lw=0.9, label="32 t / (15 $\\pi$)")
     inset.axhline(1.0, color="k", lw=0.5)
     inset.set_title("early times", fontsize="small")
     inset.tick_params(labelsize="small")
     top = float(data.center.max())
-    ax.set(xlabel=plots.TIME_LABEL, ylabel="center of energy R / particle distance", xlim=(0, config.stop), ylim=(0, 1.05 * top))
+    ax.set(
+        xlabel=plots.TIME_LABEL,
+        ylabel="center of energy R / particle distance",
+        xlim=(0, config.stop),
+        ylim=(0, 1.05 * top),
+    )
     ax.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    figure.suptitle(f"kick at particle {config.site}, {config.realizations} chains, shaded: standard error", fontsize="medium")
+    figure.suptitle(
+        f"kick at particle {config.site}, {config.realizations} chains, shaded: standard error", fontsize="medium"
+    )
     return figure
 
 
@@ -93,14 +103,16 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
         last = data.isel(strength=i, time=-1)
         rows.append(Row(f"xi = {xi:g}: R at t = {config.stop:g}", float(last.center), float(last.center_stderr),
                         note=f"R / t = {float(last.center) / config.stop:.5f}, limit {BALLISTIC:.5f}" if xi == 0 else ""))  # fmt: skip
-        rows += [Row(f"xi = {xi:g}: mean speed of R, t = {a:g} to {b:g}", speed(data, i, a, b)) for a, b in phases(config)]
+        rows += [
+            Row(f"xi = {xi:g}: mean speed of R, t = {a:g} to {b:g}", speed(data, i, a, b)) for a, b in phases(config)
+        ]
     return rows
 
 
 def explain(data: xarray.Dataset, config: Config) -> str:
     rest, leaving, late = ([speed(data, i, a, b) for i in range(len(config.strengths))] for a, b in phases(config))
     spread = (max(leaving) - min(leaving)) / max(leaving)
-    slower = all(a > b for a, b in zip(late, late[1:], strict=False))
+    slower = all(a > b for a, b in pairwise(late))
     return (
         f"R hardly moves up to t = 1 (mean speed {max(rest):.2f} at most), as in the paper's inset. The paper then sees one speed for all\n"
         f"disorders; from t = 2 to 5 the speeds differ by {100 * spread:.0f} %. Stronger disorder is slower later on"

@@ -19,7 +19,7 @@ from torchchain import plots
 KINDS = ((1.95, "superballistic"), (1.05, "superdiffusive"), (0.95, "diffusive"), (0.0, "subdiffusive"))
 
 
-def local_slopes(times: np.ndarray, width: np.ndarray, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
+def local_slopes(times: np.ndarray, width: np.ndarray, points: int = 100) -> tuple[np.ndarray, np.ndarray]:
     """d log r^2 / d log t between points half an octave apart."""
     ends = np.geomspace(1.0, times[-1], points)
     half = 2**0.25
@@ -43,12 +43,21 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     left.plot([], [], "k--", lw=0.8, label="power laws")
     left.set(xlabel=plots.TIME_LABEL, ylabel="mean squared width r$^2$", xscale="log", yscale="log", title="(a)")
     left.legend(fontsize="small")
-    for value, text in ((2, "ballistic"), (1, "diffusive"), (0.5, "infinite time, $\\xi$ > 0")):
+    for value, text in ((2, "ballistic"), (1, "diffusive"), (0.5, "$\\xi$ > 0,\ninfinite time")):
         right.axhline(value, color="k", lw=0.6, ls=":")
-        right.text(times[-1], value, text, fontsize="small", ha="right", va="bottom")
+        right.text(1.02, value, text, fontsize="small", va="center", transform=right.get_yaxis_transform())
     right.axvspan(*config.window, color="0.93", zorder=0)
-    right.set(xlabel=plots.TIME_LABEL, ylabel="local exponent d log r$^2$ / d log t", xscale="log", ylim=(0, None), title="(b)")
-    figure.suptitle(f"kick at particle {config.site}, {config.realizations} chains; gray: window of the power laws", fontsize="medium")
+    right.set(
+        xlabel=plots.TIME_LABEL,
+        ylabel="local exponent d log r$^2$ / d log t",
+        xscale="log",
+        ylim=(0, None),
+        title="(b)",
+    )
+    figure.suptitle(
+        f"kick at particle {config.site}, {config.realizations} chains; gray: window of the power laws",
+        fontsize="medium",
+    )
     return figure
 
 
@@ -67,7 +76,13 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
         if xi == 0:
             last = data.isel(strength=i, time=-1)
             limit = 0.5 - fig06.BALLISTIC**2
-            rows.append(Row(f"xi = 0: r^2 / t^2 at t = {config.stop:g}", float(last.width) / config.stop**2, note=f"limit {limit:.6f}"))
+            rows.append(
+                Row(
+                    f"xi = 0: r^2 / t^2 at t = {config.stop:g}",
+                    float(last.width) / config.stop**2,
+                    note=f"limit {limit:.6f}",
+                )
+            )
     return rows
 
 

@@ -123,7 +123,7 @@ def run(script: Script, arguments: Sequence[str] | None = None) -> int:
 
 def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
     began, stages = time.time(), {}
-    _check_device(flags.device)
+    checks.device("device", flags.device)
     data = script.measure(flags.settings, flags.device)
     stages["measure"] = time.time() - began
     rows = script.compare(data, flags.settings)
@@ -135,7 +135,7 @@ def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
         {
             "config.toml": outputs.text(config),
             "results.nc": outputs.dataset(data.assign(_table(rows))),
-            "figure.png": _png(figure),
+            "figure.png": outputs.figure(figure),
             "report.txt": outputs.text(report),
             "run.json": outputs.run_record(
                 arguments, config, flags.device, began, stages,
@@ -154,7 +154,7 @@ def _redraw(script: Script, flags: Any, out: Path) -> None:
     rows = script.compare(data, flags.settings)
     report = _report(script, data, flags.settings, rows)
     outputs.write(
-        out, {"figure.png": _png(script.draw(data, flags.settings)), "report.txt": outputs.text(report)}
+        out, {"figure.png": outputs.figure(script.draw(data, flags.settings)), "report.txt": outputs.text(report)}
     )  # the data and their record stay
     print(report, end="")
     print(f"redrawn in {out}")
@@ -221,17 +221,6 @@ def _plain(value: Any) -> Any:
 
 def _toml(settings: Any) -> str:
     return tomli_w.dumps({name: _plain(value) for name, value in dataclasses.asdict(settings).items()})
-
-
-def _check_device(name: str) -> None:
-    try:
-        torch.empty(0, device=torch.device(name))
-    except (RuntimeError, AssertionError) as error:
-        raise checks.fail("device", "be available here", f"{name!r}: {str(error).splitlines()[0][:100]}") from None
-
-
-def _png(figure: Figure) -> outputs.Writer:
-    return lambda path: figure.savefig(path, dpi=150)
 
 
 def _table(rows: list[Row]) -> dict[str, Any]:

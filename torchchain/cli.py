@@ -184,11 +184,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             return commands.run(flags, arguments)
         except (FieldError, FieldTypeError) as error:
-            return _complain(str(error), 2)
+            return complain(str(error), 2)
         except (RuntimeError, MemoryError) as error:  # a solver that gives up, or no memory left
-            return _complain(str(error) or type(error).__name__, 1)
+            return complain(str(error) or type(error).__name__, 1)
     except KeyboardInterrupt:
-        return _complain("interrupted, nothing was written", 130)
+        return complain("interrupted, nothing was written", 130)
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -205,11 +205,11 @@ def _parse(arguments: list[str]) -> Any:
             )
     except SystemExit as stop:
         if stop.code:
-            _complain(_one_line(caught.getvalue()), 2)
+            complain(one_line(caught.getvalue()), 2)
         raise
 
 
-def _one_line(report: str) -> str:
+def one_line(report: str) -> str:
     """The parser's boxed report as one line: flag, rule, value."""
     lines = [line.strip("│╭╮╰╯─ ").strip() for line in report.splitlines()]
     text = " ".join(line for line in lines if line.strip("-"))
@@ -221,7 +221,8 @@ def _one_line(report: str) -> str:
     return text
 
 
-def _complain(message: str, status: int) -> int:
+def complain(message: str, status: int) -> int:
+    """Print an error as one line on standard error and hand back the exit status."""
     print(f"torchchain: error: {' '.join(message.split())}", file=sys.stderr)
     return status
 

@@ -66,10 +66,6 @@ def _figure(width: float, height: float, rows: int, columns: int) -> Any:
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _png(figure: Any) -> outputs.Writer:
-    return lambda path: figure.savefig(path, dpi=150)
-
-
 def run_simulate(flags: Simulate, arguments: list[str]) -> None:
     """Measure a scene's observables and leave config, data, figure and record in the output folder."""
     began = time.time()
@@ -85,7 +81,7 @@ def run_simulate(flags: Simulate, arguments: list[str]) -> None:
         {
             "config.toml": outputs.text(config),
             "results.nc": outputs.dataset(data),
-            "figure.png": _png(figure),
+            "figure.png": outputs.figure(figure),
             "run.json": outputs.run_record(
                 arguments, config, device, began, stages.seconds, seed=scene.seed, method=flags.method,
                 realized={name: data.attrs[name] for name in ("mass_mean", "mass_sd")},
@@ -165,7 +161,7 @@ def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
                 "config.toml": outputs.text(config),
                 "transfer.nc": outputs.dataset(data),
                 "model.safetensors": master.save,
-                "figure.png": _png(figure),
+                "figure.png": outputs.figure(figure),
                 "run.json": outputs.run_record(
                     arguments, config, device, began, stages.seconds, seed=scene.seed, method=flags.method,
                     realized=transfer.attributes, summary=dict(rows),
@@ -194,8 +190,7 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
             "model",
             f"{master.calibration.model}, fitted by {master.calibration.method}, {master.model.n_parameters} parameters",
         ),
-        ("conservation defect of Q", master.conservation_defect),
-        ("most negative rate", master.most_negative_rate),
+        ("conservation defect", master.model.conservation_defect),
         ("lowest predicted share of energy", float(predicted.min())),
     ]
     if bool(early.any()):
@@ -321,7 +316,7 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
         {
             "config.toml": outputs.text(text),
             "results.nc": outputs.dataset(data),
-            "figure.png": _png(figure),
+            "figure.png": outputs.figure(figure),
             "run.json": outputs.run_record(
                 arguments, text, device, began, stages.seconds, seed=flags.seed, method=flags.method
             ),

@@ -93,6 +93,15 @@ def dataset(data: xarray.Dataset) -> Writer:
     return writer
 
 
+def figure(drawn: Any) -> Writer:
+    """A writer of a matplotlib figure, as PNG."""
+
+    def writer(path: Path) -> None:
+        drawn.savefig(path, dpi=150)
+
+    return writer
+
+
 def run_record(
     arguments: Sequence[str], config: str, device: str, began: float, stages: dict[str, float], **more: Any
 ) -> Writer:

@@ -109,7 +109,9 @@ def exponents(ax: Axes, x: np.ndarray, fits: Sequence[Any], xlabel: str) -> Axes
 
     Each fit has ``exponent``, ``stderr``, ``lower`` and ``upper``.
     """
-    ax.errorbar(x, [fit.exponent for fit in fits], [fit.stderr for fit in fits], fmt="ko-", capsize=3, label="whole window")
+    ax.errorbar(
+        x, [fit.exponent for fit in fits], [fit.stderr for fit in fits], fmt="ko-", capsize=3, label="whole window"
+    )
     ax.plot(x, [fit.lower for fit in fits], "v", color="C0", mfc="none", label="lower half")
     ax.plot(x, [fit.upper for fit in fits], "^", color="C3", mfc="none", label="upper half")
     ax.set(xlabel=xlabel, ylabel="exponent")

@@ -127,6 +127,13 @@ def calibrate(
         rates, report = _nonlinear(transfer, free, window, linear, progress)
     else:
         rates, report = _adam(transfer, basis, linear, AdamSettings(**settings), progress)
+    growth = float(torch.linalg.eigvals(rates).real.max())
+    if growth > 1e-6:
+        warnings.warn(
+            f"rates fitted by '{method}' make energy grow as exp({growth:.3g} t): do not predict beyond t = {1 / growth:.3g}",
+            FitWarning,
+            stacklevel=2,
+        )
     return MasterEquation(RateModel(rates, basis), replace(record, report=report))
 
 

@@ -97,12 +97,12 @@ class MasterEquation(nn.Module):
 
     @property
     def conservation_defect(self) -> float:
-        """Largest row sum of Q without its damping, per unit time: 0 where energy is conserved."""
-        return float(self.rates.detach().sum(-1).abs().max())
+        """How far the model, without its damping, is from conserving energy; see the model's own."""
+        return self.model.conservation_defect
 
     @property
     def most_negative_rate(self) -> float:
-        """The most negative rate between two bands; 0 if none is negative."""
+        """The most negative rate of Q between two bands; 0 if none is negative."""
         rates = self.rates.detach()
         return min(0.0, float((rates - torch.diag(rates.diagonal())).min()))
 

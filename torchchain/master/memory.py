@@ -92,6 +92,12 @@ class MemoryModel(TransferModel):
     def n_parameters(self) -> int:
         return self.basis.numel() + self.amplitudes[1:].numel() + len(self.decay) + 2 * len(self.pair_decay)
 
+    @property
+    def conservation_defect(self) -> float:
+        """Largest share of energy that a source gains or loses at any time: the row sums of Pi - I and of all A_m."""
+        leak = (self.basis.sum(-1) - 1).abs() + self.amplitudes.sum(-1).abs().sum(0)
+        return float(leak.max())
+
     def tensors(self) -> dict[str, Tensor]:
         names = ("basis", "amplitudes", "decay", "pair_decay", "pair_frequency", "damping")
         return {"rates": self.rates, **{name: getattr(self, name) for name in names}}

@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from torchchain import checks
 
-
 LONGEST_FLOW = 1e9
 """Largest rate times time for the matrix exponential, whose rounding grows with it: 1e-7 or so there, all digits at 1e16."""
 
@@ -48,6 +47,11 @@ class TransferModel(nn.Module):
     @property
     def n_parameters(self) -> int:
         """Fitted numbers."""
+        raise NotImplementedError
+
+    @property
+    def conservation_defect(self) -> float:
+        """How far the model, without its damping, is from conserving energy; 0 where it does."""
         raise NotImplementedError
 
     def tensors(self) -> dict[str, Tensor]:
@@ -125,6 +129,11 @@ class RateModel(TransferModel):
         """All of Q, and the basis where it is a matrix of its own."""
         diagonal = torch.diag(self.basis.diagonal())
         return self.n_bands**2 + (0 if torch.equal(diagonal, self.basis) else self.n_bands**2)
+
+    @property
+    def conservation_defect(self) -> float:
+        """Largest row sum of Q, per unit time."""
+        return float(self.rates.detach().sum(-1).abs().max())
 
     def tensors(self) -> dict[str, Tensor]:
         return {"rates": self.rates, "basis": self.basis, "damping": self.damping}
