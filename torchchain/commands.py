@@ -18,6 +18,7 @@ from torchchain.cli import Calibrate, Plan, Predict, SceneFlags, Simulate
 from torchchain.ensemble import BandTransfer, Stages, band_transfer, simulate
 from torchchain.evolvers import METHODS
 from torchchain.master import SOLVERS, MasterEquation, calibrate
+from torchchain.master.calibration import recipe
 from torchchain.scene import Scene, describe, read_toml, regular_times
 from torchchain.statistics import statistical_distance, total_variation
 
@@ -130,13 +131,17 @@ def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
     """Ensemble, master equation, prediction and their distance; leaves data, model, figure and record."""
     began = time.time()
     scene, extra = _scene(flags, ("calibration",))
-    settings = _merge(extra.get("calibration", {}), flags.calibration())
+    table = extra.get("calibration", {})
+    if not isinstance(table, Mapping):
+        raise checks.FieldTypeError(f"calibration must be a table, got {checks.shown(table)}")
+    settings = _merge(table, flags.calibration())
     checks.known_keys("calibration", settings, ("method", "model", "window", "constraint", "penalty", "steps", "learning_rate", "tolerance", "order"))  # fmt: skip
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])
     out, device = outputs.check_writable(flags.out), str(checks.device("device", flags.device))
     checks.choice("method", flags.method, ("auto", *METHODS))
+    recipe(scene, **settings)  # before the ensemble is computed
     stages = Stages()
     transfer = band_transfer(scene, flags.method, device=device, progress=True, stages=stages)
     with stages("calibration"), warnings.catch_warnings(record=True) as caught:

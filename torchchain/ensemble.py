@@ -22,6 +22,7 @@ from torchchain.energy import energy_center, energy_width, particle_energy, tota
 from torchchain.evolvers import METHODS, Trajectory, fused, start
 from torchchain.evolvers.linearity import elongation_estimate, warn_if_nonlinear
 from torchchain.excitation import Impulse, StandingWave, State
+from torchchain.modal_bands import modal_band_energy
 from torchchain.scene import Scene
 from torchchain.spectrum import NormalModes, normal_modes
 from torchchain.statistics import Moments, MomentTree
@@ -143,6 +144,12 @@ class Chunk:
                 moments = fused.energy_moments(*given, definition, **self.options)
             every = {"total_energy": moments.total, "center": moments.center, "width": moments.width}
             return {name: every[name] for name in names}
+        if self.method == "modes" and list(names) == ["band_energy"] and self.scene.energy_definition == "site":
+            modes, n_bands = self.modes, self.scene.n_bands
+            with self.stages("evolution with observables"):
+                windows = self.times.split(self.window)
+                bands = [modal_band_energy(self.chain, self.state, part, n_bands, modes=modes) for part in windows]
+                return {"band_energy": torch.cat(bands, dim=-2)}
         parts: dict[str, list[Tensor]] = {name: [] for name in names}
         for trajectory in self.trajectories():
             with self.stages("observables"):

@@ -89,7 +89,7 @@ def decay_comparison(
         ax.plot(times, predicted[index], "--", color=ax.lines[-1].get_color())
     ax.plot([], [], "k-", label="ensemble")
     ax.plot([], [], "k--", label="model")
-    ax.set(xlabel=TIME_LABEL, ylabel="share of energy", title=title, yscale="log")
+    ax.set(xlabel=TIME_LABEL, ylabel="share of energy", title=title, yscale="log", ylim=(1e-4, 1.5))
     ax.legend(fontsize="small")
     return ax
 

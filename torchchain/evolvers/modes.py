@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -38,16 +39,14 @@ def align_modes(chain: Chain, shapes: Tensor, field: Tensor) -> Tensor:
     return shapes.reshape(*chain.batch_shape, *[1] * (field.ndim - batch - 1), *shapes.shape[-2:])
 
 
-def start(chain: Chain, state: State, modes: NormalModes | None = None) -> Advance:
-    """See the registry entry below."""
-    modes = normal_modes(chain) if modes is None else modes
+def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """From times to position and speed of every mode at each, (*batch, *any, time, mode) (Eq. 20)."""
     displacement, velocity = (z[..., None, :] for z in modal_amplitudes(chain, state, modes))
-    back = modes.shapes.mT
     frequency = chain.align(modes.frequencies, state.displacement)[..., None, :]
     moves = state.velocity.requires_grad or bool((state.velocity != 0).any())
     displaced = state.displacement.requires_grad or bool((state.displacement != 0).any())
 
-    def advance(times: Tensor) -> Trajectory:
+    def motion(times: Tensor) -> tuple[Tensor, Tensor]:
         t = times.to(state.displacement)[:, None]
         phase = frequency * t
         cosine = phase.cos()
@@ -60,7 +59,19 @@ def start(chain: Chain, state: State, modes: NormalModes | None = None) -> Advan
             position = position + (t * torch.sinc(phase / math.pi)) * velocity
             speed = speed + cosine * velocity
         shape = torch.broadcast_shapes(position.shape, phase.shape)
-        return Trajectory(times, change_basis(position.expand(shape), back), change_basis(speed.expand(shape), back))
+        return position.expand(shape), speed.expand(shape)
+
+    return motion
+
+
+def start(chain: Chain, state: State, modes: NormalModes | None = None) -> Advance:
+    """See the registry entry below."""
+    modes = normal_modes(chain) if modes is None else modes
+    motion, back = modal_motion(chain, state, modes), modes.shapes.mT
+
+    def advance(times: Tensor) -> Trajectory:
+        position, speed = motion(times)
+        return Trajectory(times, change_basis(position, back), change_basis(speed, back))
 
     return advance
 

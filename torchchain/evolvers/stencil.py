@@ -307,7 +307,8 @@ def _quiet(w, row, u, v, used, stiff, p, limit):
     """
     for j in range(used):
         x, y = w[u[j] + p], w[v[j] + p]
-        if w[row.mass + p] * (y * y + stiff * (w[row.left + p] + w[row.right + p]) * x * x) > limit:
+        share = w[row.mass + p] * (y * y + stiff * (w[row.left + p] + w[row.right + p]) * x * x)
+        if share > limit or (share == 0.0 and (x != 0.0 or y != 0.0)):  # the square of 1e-170 is zero
             return False
     return True
 
@@ -751,14 +752,10 @@ class March:
         )  # fmt: skip
 
 
-def share(work: Callable[[int, int], None], count: int, longest: int | None = None) -> None:
-    """Runs work(begin, end) over rows 0 to count - 1 side by side, in ranges of at most ``longest`` rows.
-
-    As many threads as torch uses, with a few ranges for each; within ``work``, torch uses one.
-    """
+def share(work: Callable[[int, int], None], count: int) -> None:
+    """Runs work(begin, end) over rows 0 to count - 1 side by side, a few ranges of them for each of torch's threads."""
     workers = min(torch.get_num_threads(), count)
     size = -(-count // (4 * workers if workers > 1 else 1))
-    size = size if longest is None else min(size, longest)
     ranges = [(begin, min(begin + size, count)) for begin in range(0, count, size)]
     for _ in map_in_order(lambda part: work(*part), ranges, workers):
         pass

@@ -69,7 +69,10 @@ def save(model: TransferModel, record: Mapping[str, Any], path: str | Path) -> N
             "torchdiffeq": torchdiffeq.__version__,
         },
     }
-    metadata = {"torchchain": json.dumps(header, sort_keys=True, allow_nan=False)}
+    try:
+        metadata = {"torchchain": json.dumps(header, sort_keys=True, allow_nan=False)}
+    except ValueError:  # everything else in the header has been checked
+        raise checks.fail("calibration.report", "hold finite numbers", record["report"]) from None
     tensors = {name: value.detach().cpu().contiguous() for name, value in model.tensors().items()}
     path = Path(path)
     try:

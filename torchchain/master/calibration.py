@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -16,9 +16,10 @@ from torchchain import checks
 from torchchain.ensemble import BandTransfer
 from torchchain.master.adam import AdamSettings, fit_rates
 from torchchain.master.equation import Calibration, MasterEquation
-from torchchain.master.fits import FitWarning, analytic_prefactor, linear_rates, nonlinear_rates, profile
-from torchchain.master.memory import LADDER, MemoryModel, fit_memory
+from torchchain.master.fits import FitWarning, analytic_prefactor, linear_rates, nonlinear_rates, profile, within
+from torchchain.master.memory import LADDER, MemoryModel, checked_order, fit_memory
 from torchchain.master.model import RateModel
+from torchchain.scene import Scene
 from torchchain.statistics import total_variation
 from torchchain.threads import single_blas_thread, single_thread
 from torchchain.wavenumber import basis_fraction
@@ -63,6 +64,53 @@ BASES: dict[str, Callable[[BandTransfer], Tensor]] = {
 MODELS = (*BASES, "memory")
 
 
+@dataclass(frozen=True)
+class Recipe:
+    """A calibration in every detail: what :func:`calibrate` makes of its arguments."""
+
+    method: str
+    model: str
+    window: tuple[float, float]
+    adam: AdamSettings
+    order: tuple[int, int] | None
+
+
+def recipe(
+    scene: Scene,
+    method: str | None = None,
+    model: str | None = None,
+    window: tuple[float, float] | None = None,
+    long_time: bool = True,
+    **settings: Any,
+) -> Recipe:
+    """The arguments of :func:`calibrate`, checked before hours go into an ensemble for them.
+
+    Args:
+        scene: of the transfer to come.
+        method, model, window, settings: see :func:`calibrate`.
+        long_time: whether the transfer holds the long-time average.
+    """
+    if method is not None:
+        checks.choice("method", method, METHODS)
+    if model is None:
+        model = "memory" if method in (None, "projection") and long_time else "basis_matrix" if long_time else "paper"
+    checks.choice("model", model, MODELS)
+    if method is None:
+        method = "projection" if model == "memory" else "adam"
+    if (method == "projection") != (model == "memory"):
+        fitting = "memory" if method == "projection" else ", ".join(BASES)
+        raise checks.fail("model", f"be one of {fitting} for method '{method}'", repr(model))
+    allowed = {"adam": [entry.name for entry in fields(AdamSettings)], "projection": ["order"]}.get(method, [])
+    checks.known_keys(f"settings of method '{method}'", settings, allowed)
+    order = settings.pop("order", None)
+    if order is not None:
+        order = checked_order(order, len(scene.times))
+    window = _window(window, NONLINEAR_WINDOW if method == "nonlinear" else LINEAR_WINDOW)
+    if not scene.is_ordered:
+        within(scene.times, window, 4 if method == "nonlinear" else 2)
+    return Recipe(method, model, window, AdamSettings(**settings), order)
+
+
 def calibrate(
     transfer: BandTransfer,
     method: str | None = None,
@@ -95,20 +143,8 @@ def calibrate(
     Warns:
         FitWarning: naming how many entries of the nonlinear fit did not converge, or that Adam did not.
     """
-    if method is not None:
-        checks.choice("method", method, METHODS)
-    if model is None:
-        richest = "paper" if transfer.long_time is None else "basis_matrix"
-        model = "memory" if method in (None, "projection") and transfer.long_time is not None else richest
-    checks.choice("model", model, MODELS)
-    if method is None:
-        method = "projection" if model == "memory" else "adam"
-    if (method == "projection") != (model == "memory"):
-        fitting = "memory" if method == "projection" else ", ".join(BASES)
-        raise checks.fail("model", f"be one of {fitting} for method '{method}'", repr(model))
-    allowed = {"adam": [entry.name for entry in fields(AdamSettings)], "projection": ["order"]}.get(method, [])
-    checks.known_keys(f"settings of method '{method}'", settings, allowed)
-    window = _window(window, NONLINEAR_WINDOW if method == "nonlinear" else LINEAR_WINDOW)
+    chosen = recipe(transfer.scene, method, model, window, transfer.long_time is not None, **settings)
+    method, model, window = chosen.method, chosen.model, chosen.window
     basis = BASES.get(model, exact_basis)(transfer)
     record = Calibration(method, model, window, transfer.scene)
     if transfer.scene.is_ordered:
@@ -116,7 +152,7 @@ def calibrate(
     free = (1 - basis.diagonal()).clamp(min=torch.finfo(basis.dtype).eps)
     linear = linear_rates(transfer.times, transfer.mean, free, window)
     if model == "memory":
-        tensors, report = _memory(transfer, settings.get("order"), progress)
+        tensors, report = _memory(transfer, chosen.order, progress)
         return MasterEquation(MemoryModel(rates=linear, **tensors), replace(record, report=report))
     if method == "analytic":
         q0, error = analytic_prefactor(linear)
@@ -126,7 +162,7 @@ def calibrate(
     elif method == "nonlinear":
         rates, report = _nonlinear(transfer, free, window, linear, progress)
     else:
-        rates, report = _adam(transfer, basis, linear, AdamSettings(**settings), progress)
+        rates, report = _adam(transfer, basis, linear, chosen.adam, progress)
     growth = float(torch.linalg.eigvals(rates).real.max())
     if growth > 1e-6:
         warnings.warn(

@@ -119,9 +119,9 @@ def _exponential(t: np.ndarray, y: np.ndarray, level: float) -> tuple[float, flo
         return np.stack([(e - 1) / x, slope / x * ((t - t0) * e - (e - 1) / x), -slope * e], axis=1)
 
     line = np.polyfit(t, y, 1)
-    if line[0] == 0:
+    if abs(line[0]) * (t[-1] - t[0]) <= 1e-12 * np.abs(y).max():  # flat to rounding
         return None
-    t0 = float(np.clip((level - line[1]) / line[0], 0.0, t[0])) if line[0] else 0.5
+    t0 = float(np.clip((level - line[1]) / line[0], 0.0, t[0]))
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("error", optimize.OptimizeWarning)

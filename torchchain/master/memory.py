@@ -131,6 +131,16 @@ class MemoryModel(TransferModel):
         )
 
 
+def checked_order(order: Any, n_times: int) -> tuple[int, int]:
+    """Numbers of exponentials and of pairs, no more functions than half the times can tell apart."""
+    if not isinstance(order, (tuple, list)) or len(order) != 2:
+        raise checks.FieldTypeError(f"order must be two integers, got {checks.shown(order)}")
+    single, pairs = checks.integer("order", order[0], 1, 16), checks.integer("order", order[1], 0, 16)
+    if 2 * (single + 2 * pairs) > n_times:
+        raise checks.fail("order", f"have at most {n_times // 2} functions for {n_times} times", (single, pairs))
+    return single, pairs
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """Residual energy D(t) = T(t) - Pi as (time, entry), and its value I - Pi at time 0 as (entry,)."""
@@ -203,10 +213,7 @@ def fit_memory(
     Returns:
         Tensors for :class:`MemoryModel` but the rates, and a report: converged, root mean square misfit.
     """
-    single, pairs = checks.integer("order", order[0], 1, 16), checks.integer("order", order[1], 0, 16)
-    order = (single, pairs)
-    if 2 * (single + 2 * pairs) > len(times):
-        raise checks.fail("order", f"have at most {len(times) // 2} functions for {len(times)} times", order)
+    single, pairs = order = checked_order(order, len(times))
     n = len(basis)
     data = (mean - basis[:, None]).transpose(0, 1).reshape(len(times), -1).numpy()
     at_zero = (torch.eye(n, dtype=basis.dtype) - basis).flatten().numpy()
