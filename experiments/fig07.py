@@ -21,9 +21,9 @@ KINDS = ((1.95, "superballistic"), (1.05, "superdiffusive"), (0.95, "diffusive")
 
 def local_slopes(times: np.ndarray, width: np.ndarray, points: int = 100) -> tuple[np.ndarray, np.ndarray]:
     """d log r^2 / d log t between points half an octave apart."""
-    ends = np.geomspace(1.0, times[-1], points)
+    ends = np.geomspace(max(1.0, times[0]), times[-1], points)
     half = 2**0.25
-    inside = ends[(ends >= half) & (ends <= times[-1] / half)]
+    inside = ends[(ends >= ends[0] * half) & (ends <= times[-1] / half)]
     log = np.log(np.interp([inside / half, inside * half], times, width))
     return inside, (log[1] - log[0]) / (2 * np.log(half))
 

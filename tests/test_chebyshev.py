@@ -85,7 +85,8 @@ def test_kernels_agree_with_torch(boundary):
         state = a_start(kind, chain)
         for times in GRIDS.values():
             one, other = (chebyshev_states(chain, state, times, compiled=compiled) for compiled in (True, False))
-            assert error(one, other) < 1e-13
+            # scipy's Bessel functions are good to 3e-15 at z = 200, the largest here, and some hundred are summed
+            assert error(one, other) < (1e-13 if times is not GRIDS["scattered"] else 3e-13)
 
 
 @pytest.mark.parametrize("grid", ["last", "all"])
@@ -349,7 +350,7 @@ def test_times_do_not_go_back(compiled):
     chain = a_chain("fixed")
     advance = start(chain, a_start("impulse", chain), "chebyshev", compiled=compiled)
     advance(torch.tensor([1.0, 2.0]))
-    with pytest.raises(FieldError, match="times must not go back behind the last window's end 2, got 1.5"):
+    with pytest.raises(FieldError, match=r"times must not go back behind the last window's end 2, got 1\.5"):
         advance(torch.tensor([1.5]))
 
 
