@@ -339,7 +339,7 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
         for j in (0, 3, 9):
             w = float(data.low_frequency[j])
             rows.append(Row(f"xi = {xi:g}, w = {w:.3g}: share of the modes below w / (w / pi)", float(data.states[i, j]) * np.pi / w,
-                            float(data.states_stderr[i, j]) * np.pi / w, note=f"{float(data.states_mass[i]) ** 0.5:.4f} for w to 0, the root of the mean mass"))  # fmt: skip
+                            float(data.states_stderr[i, j]) * np.pi / w, note=f"{float(data.states_mass[i]) ** 0.5:.4f} for w to 0, the root of the mean mass; whole counts blur {np.pi / w / 8192:.4f}"))  # fmt: skip
     for (name, limit), pair in zip(KICKS.items(), pairs(data), strict=True):
         rows += [Row(row.quantity, row.measured, row.stderr, note=f"{row.note}; {limit:g} for t to infinity")
                  for fit in pair for row in fit.rows(f"{name}: r^2 ~ t^a")]  # fmt: skip

@@ -27,6 +27,8 @@ class Config(harness.Ensemble):
     """disorder xi"""
     repeats: int = 5
     """timed runs of each way, after one that is not counted"""
+    predicted_times: int = 500
+    """times of the prediction"""
     literal_states: int = 6
     """states for which DFT TE DFT^-1 is formed in full; its time is scaled up to all"""
 
@@ -91,6 +93,16 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             if repeat:
                 seconds[name].append(time.perf_counter() - begin)
             errors[name] = max(errors[name], float(np.abs(result - reference).max()))
+    long = replace(scene, times=torch.linspace(0.0, config.stop, config.predicted_times, dtype=torch.float64))
+    begin = time.perf_counter()
+    transfer = tc.band_transfer(long, device=device)
+    ensemble = time.perf_counter() - begin
+    master = tc.calibrate(transfer)
+    every = torch.eye(scene.n_bands, dtype=torch.float64)
+    predictions = {"one": every[:1], "every": every}
+    predicted = {
+        name: _median_of(lambda start=start: master.solve(start, long.times)) for name, start in predictions.items()
+    }
     n, states = scene.n_particles, scene.realizations * len(tones) * len(times)
     literal = literal_seconds(masses[0], config.literal_states) * states
     wide = torch.ones(2048, 2048, dtype=torch.float64)
@@ -110,12 +122,24 @@ def measure(config: Config, device: str) -> xarray.Dataset:
                 {"long_name": "largest difference to the recipe"},
             ),
             "literal_seconds": ((), literal, {"units": "s", "long_name": "DFT TE DFT^-1 for every state, scaled up"}),
+            "ensemble_seconds": ((), ensemble, {"units": "s", "long_name": "ensemble that a prediction replaces"}),
+            "prediction_seconds": (("start",), list(predicted.values()), {"units": "s"}),
             "flops_eigen": ((), float(eigen)),
             "flops_product": ((), float(product)),
             "machine_flops": ((), 2 * 2048**3 / statistics.median(products), {"units": "1/s"}),
         },
-        coords={"way": list(ways)},
+        coords={"way": list(ways), "start": list(predicted)},
     )
+
+
+def _median_of(work: Callable[[], object], repeats: int = 50) -> float:
+    work()
+    samples = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        work()
+        samples.append(time.perf_counter() - begin)
+    return statistics.median(samples)
 
 
 def _median(data: xarray.Dataset, way: str) -> float:
@@ -142,6 +166,16 @@ def compare(data: xarray.Dataset, config: Config) -> list[harness.Row]:
         harness.Row("machine: Gflop/s of a large matrix product", float(data.machine_flops) / 1e9),
         harness.Row("modes: share of the machine's rate", rate / float(data.machine_flops)),
     ]
+    ensemble = float(data.ensemble_seconds)
+    rows.append(
+        harness.Row(f"ensemble of {config.predicted_times} times, with its long-time average: seconds", ensemble)
+    )
+    for name, words in (("one", "from one start"), ("every", "from every band")):
+        seconds = float(data.prediction_seconds.sel(start=name))
+        rows += [
+            harness.Row(f"prediction {words}: seconds", seconds),
+            harness.Row(f"prediction {words}: times faster than that ensemble", ensemble / seconds),
+        ]
     return rows
 
 
@@ -169,7 +203,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
 
 
 SCRIPT = harness.Script(
-    "transfer_speed", Config(), replace(Config(), n_particles=32, n_bands=4, realizations=4, stop=5.0, repeats=1, literal_states=2),
+    "transfer_speed", Config(), replace(Config(), n_particles=32, n_bands=4, realizations=4, stop=5.0, repeats=1, predicted_times=40, literal_states=2),
     measure, draw, compare, explain,
 )  # fmt: skip
 

@@ -28,7 +28,12 @@ def markov():
 
 def memory():
     part = (EYE - 0.2) / 2
-    tensors = (torch.stack([part, part, 0.1 * EYE - 0.025]), torch.tensor([0.3]), torch.tensor([0.1]), torch.tensor([0.7]))
+    tensors = (
+        torch.stack([part, part, 0.1 * EYE - 0.025]),
+        torch.tensor([0.3]),
+        torch.tensor([0.1]),
+        torch.tensor([0.7]),
+    )
     return MemoryModel(-EYE, torch.full((B, B), 0.2, dtype=torch.float64), *tensors)
 
 

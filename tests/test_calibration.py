@@ -32,7 +32,9 @@ def transfer_of(mean, times=TIMES, long_time=None, noise=0.0, disorder=None):
     blocks = np.repeat(np.asarray(mean)[None], 6, 0)
     blocks = blocks + noise * np.random.default_rng(2).normal(size=blocks.shape)
     tensor = torch.from_numpy
-    scene = tc.Scene(n_particles=8 * B, n_bands=B, times=times, realizations=6, disorder=disorder or tc.Disorder("normal", XI))
+    scene = tc.Scene(
+        n_particles=8 * B, n_bands=B, times=times, realizations=6, disorder=disorder or tc.Disorder("normal", XI)
+    )
     late = None if long_time is None else tensor(np.asarray(long_time, dtype=float))
     return tc.BandTransfer(
         scene, scene.times, tensor(blocks.mean(0)), tensor(blocks.std(0) / 5**0.5), late,
@@ -200,7 +202,9 @@ def test_the_exact_constraint_holds_whatever_the_data():
     exact = tc.calibrate(transfer_of(leaky), "adam", "paper", steps=200, tolerance=1e-3)
     assert exact.conservation_defect < 1e-15
     assert exact.most_negative_rate == 0.0
-    free = tc.calibrate(transfer_of(leaky), "adam", "paper", constraint="penalty", penalty=0.0, steps=200, tolerance=1e-3)
+    free = tc.calibrate(
+        transfer_of(leaky), "adam", "paper", constraint="penalty", penalty=0.0, steps=200, tolerance=1e-3
+    )
     assert free.conservation_defect > 0.01
     assert free.most_negative_rate < 0
     # More freedom fits better; more weight on conservation leaks less.
@@ -301,7 +305,9 @@ def test_richer_models_are_nearer_to_the_ensemble(small_transfer):
     assert memory < matrix < adam < linear
 
 
-@pytest.mark.parametrize(("method", "model"), [(None, None), ("linear", "paper"), ("nonlinear", "paper"), ("adam", None)])
+@pytest.mark.parametrize(
+    ("method", "model"), [(None, None), ("linear", "paper"), ("nonlinear", "paper"), ("adam", None)]
+)
 def test_without_disorder_nothing_moves(method, model):
     ordered = tc.Scene(n_particles=32, n_bands=4, disorder=tc.Disorder(strength=0.0), realizations=3, times=TIMES)
     master = tc.calibrate(tc.band_transfer(ordered, "modes"), method, model)
@@ -340,7 +346,12 @@ DATA = transfer_of(markov(conserving_rates(), np.diag(psi())), long_time=np.diag
         (("linear", "paper", ("a", 1)), {}, FieldTypeError, "window must be a number"),
         (("linear", "paper", (0.3, 0.4)), {}, FieldError, "window must hold at least 2 of the transfer's times, got 0"),
         (("linear", "paper", (0.3, 0.6)), {}, FieldError, "window must hold at least 2 of the transfer's times, got 1"),
-        (("nonlinear", "paper", (1, 1.5)), {}, FieldError, "window must hold at least 4 of the transfer's times, got 3"),
+        (
+            ("nonlinear", "paper", (1, 1.5)),
+            {},
+            FieldError,
+            "window must hold at least 4 of the transfer's times, got 3",
+        ),
         (("linear",), {"penalty": 1}, FieldError, "settings of method 'linear' must have only the keys"),
         (("adam",), {"order": (1, 1)}, FieldError, "settings of method 'adam' must have only the keys"),
         (("adam",), {"constraint": "none"}, FieldError, "constraint must be one of exact, penalty"),

@@ -34,7 +34,7 @@ def run(tmp_path, monkeypatch, capsys):
 @pytest.fixture
 def no_drawing(monkeypatch):
     """Figures are made but not rendered, which takes longer than all the rest of a small run."""
-    monkeypatch.setattr(commands, "_png", lambda figure: lambda path: path.write_bytes(b""))
+    monkeypatch.setattr(commands.outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
 
 
 @pytest.fixture(scope="module")
@@ -273,11 +273,17 @@ FLAGS = [
     ("--disorder.kind binary --disorder.strength 0.99", "disorder.strength must be less than 1 - lower"),
     ("--excitation.kind kick", "excitation.kind must be one of impulse, standing_wave, got 'kick'"),
     ("--excitation.site 3", "excitation must have only the keys tones, amplitude, phase, got 'site'"),
-    ("--excitation.kind impulse --excitation.tones 1", "excitation must have only the keys site, velocity, got 'tones'"),
+    (
+        "--excitation.kind impulse --excitation.tones 1",
+        "excitation must have only the keys site, velocity, got 'tones'",
+    ),
     ("--excitation.kind impulse --excitation.site 0", "excitation.site must be at least 1, got 0"),
     ("--excitation.kind impulse --excitation.site 33", "excitation.site must be at most 32, got 33"),
     ("--excitation.kind impulse --excitation.site 1.5", "--excitation.site must be INT, got '1.5'"),
-    ("--excitation.kind impulse --excitation.velocity 0", "excitation.velocity must have a size between 1e-60 and 1e60"),
+    (
+        "--excitation.kind impulse --excitation.velocity 0",
+        "excitation.velocity must have a size between 1e-60 and 1e60",
+    ),
     ("--excitation.kind impulse --excitation.velocity 1e200", "excitation.velocity must have a size between"),
     ("--excitation.kind impulse --excitation.velocity inf", "excitation.velocity must be finite, got inf"),
     ("--excitation.tones 0", "excitation.tones must be at least 1, got 0"),
@@ -426,7 +432,7 @@ CONFIGS = [
     ("n_bands =", "must be a TOML file, got Invalid value"),
     ("[times]\nstop = 3", "times must have step"),
     ("observables = 'energy'", "observables must be a list of names"),
-    ("boundary = \"\"\"open\nring\"\"\"", "boundary must be one of periodic, fixed, got 'open\\nring'"),
+    ('boundary = """open\nring"""', "boundary must be one of periodic, fixed, got 'open\\nring'"),
     ("tolerance = 1979-05-27", "tolerance must be a number"),
 ]
 
@@ -533,7 +539,9 @@ def test_a_write_that_fails_leaves_nothing(run, monkeypatch, tmp_path):
         return writer
 
     monkeypatch.setattr(commands.outputs, "dataset", full)
-    assert "out must be writable, got out: No space left on device" in complains(run("simulate", *SMALL, "--out", "out"))
+    assert "out must be writable, got out: No space left on device" in complains(
+        run("simulate", *SMALL, "--out", "out")
+    )
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "results.nc").write_text("before")
     complains(run("simulate", *SMALL, "--out", "old"))

@@ -78,9 +78,7 @@ def test_the_literal_master_equation():
     at = model.solve(initial, [2 - h, 2.0, 2 + h]).detach().numpy()
     slope = (at[2] - at[0]) / (2 * h)
     free = at[1] - initial * psi * np.exp(-damping * 2.0)
-    expected = [
-        sum(rates[r, s] * free[r] for r in range(B)) - damping[s] * at[1][s] for s in range(B)
-    ]
+    expected = [sum(rates[r, s] * free[r] for r in range(B)) - damping[s] * at[1][s] for s in range(B)]
     np.testing.assert_allclose(slope, expected, atol=1e-8)  # h^2 and eps / h
 
 
@@ -174,7 +172,9 @@ def test_semigroup(method):
     initial = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
     there = model.solve(initial, [13.0], method).detach()
     halfway = model.solve(initial, [5.0], method).detach()[-1]
-    assert torch.allclose(model.solve(halfway, [8.0], method), there, rtol=0, atol=1e-7 if method == "dopri8" else 1e-13)
+    assert torch.allclose(
+        model.solve(halfway, [8.0], method), there, rtol=0, atol=1e-7 if method == "dopri8" else 1e-13
+    )
     # and with it, in the enlarged state
     parts = master(conserving_rates(), basis_matrix()).model.embedding()
     step = torch.linalg.matrix_exp(5 * parts.generator)
@@ -257,7 +257,9 @@ def memory_model(damping=None):
         "rates": np.zeros((n, n)), "basis": basis, "amplitudes": amplitudes,
         "decay": [0.5, 0.05], "pair_decay": [0.1], "pair_frequency": [0.7],
     }  # fmt: skip
-    return MemoryModel(**{name: torch.as_tensor(x, dtype=torch.float64) for name, x in tensors.items()}, damping=damping)
+    return MemoryModel(
+        **{name: torch.as_tensor(x, dtype=torch.float64) for name, x in tensors.items()}, damping=damping
+    )
 
 
 @pytest.mark.parametrize("damped", [False, True])
@@ -317,7 +319,12 @@ EXPLODING = master(np.diag(np.full(B, 1.0)), np.zeros(B))
         ((np.eye(B), [1.0], "dopri5"), {"rtol": 1}, FieldError, "rtol must be less than 1"),
         ((np.eye(B), [1.0], "dopri5"), {"atol": NAN}, FieldError, "atol must be finite"),
         ((np.eye(B), [1.0], "scipy_solver"), {"solver": "x"}, FieldError, "solver must be one of RK45"),
-        ((np.eye(B), [1.0], "dopri5"), {"rtol": 1e-300, "atol": 1e-300}, IntegrationError, "must reach time 1 with rtol"),
+        (
+            (np.eye(B), [1.0], "dopri5"),
+            {"rtol": 1e-300, "atol": 1e-300},
+            IntegrationError,
+            "must reach time 1 with rtol",
+        ),
         (([1e308] * B, [1.0]), {}, None, ""),
         ((np.eye(B), [1e300]), {}, FieldError, "times must be at most .*, where rounding blurs these rates"),
     ],

@@ -176,7 +176,10 @@ def test_bad_fields(fields, error, message):
         ("[stiffness_disorder]\nkind = 'x'", "^stiffness_disorder.kind must be one of"),
         ("[excitation]\nkind = 'kick'", "excitation.kind must be one of impulse, standing_wave, got 'kick'"),
         ("[excitation]\nkind = 3", "excitation.kind must be a string"),
-        ("[excitation]\nkind = 'impulse'\ntones = [1]", "excitation must have only the keys site, velocity, got 'tones'"),
+        (
+            "[excitation]\nkind = 'impulse'\ntones = [1]",
+            "excitation must have only the keys site, velocity, got 'tones'",
+        ),
         ("[excitation]\ntones = 'all'", "excitation.tones must be a list of integers"),
         ("[excitation]\ntones = [true]", "excitation.tones must be an integer, got True"),
         ("times = 3", "times must be one-dimensional"),

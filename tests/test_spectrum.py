@@ -154,9 +154,7 @@ def test_a_failing_solver_is_reported(monkeypatch):
         tc.normal_modes(disordered(10, "fixed"))
 
 
-@pytest.mark.parametrize(
-    "masses", [[1e-308, 1.0, 1.0], [1e308, 1e308, 1.0], [1e-300, 1e300, 1.0], [5e-324, 1.0, 1.0]]
-)
+@pytest.mark.parametrize("masses", [[1e-308, 1.0, 1.0], [1e308, 1e308, 1.0], [1e-300, 1e300, 1.0], [5e-324, 1.0, 1.0]])
 def test_masses_beyond_the_solver(masses):
     with pytest.raises(DecompositionError):
         tc.normal_modes(tc.Chain(masses))

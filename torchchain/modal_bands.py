@@ -50,7 +50,9 @@ def modal_band_energy(
     energy = (change_basis(speed, momentum) * change_basis(speed, wave)) @ bins
     shape = change_basis(position, wave)
     if chain.is_uniform_ring:
-        strain = chain.contact_stiffness.flatten()[0] * 4 * torch.sin(math.pi / chain.n_particles * tone.to(wave)).square()
+        strain = (
+            chain.contact_stiffness.flatten()[0] * 4 * torch.sin(math.pi / chain.n_particles * tone.to(wave)).square()
+        )
         energy = energy + shape.square() @ (strain[:, None] * bins)
     else:  # -K s_j = w_j^2 M s_j
         force = modes.frequencies.square()[..., :, None] * momentum

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy import special
 from torch import Tensor
 
 from torchchain import checks
@@ -161,11 +160,7 @@ def coefficients(frequency: np.ndarray, time: np.ndarray, tolerance: float) -> n
         tolerance: see above.
     """
     z = frequency * time
-    # By Kapteyn's inequality (DLMF, Section 10.14) |J| < 1e-25 from here on. Each realization has its own end, so that it gets
-    # the same sums in any batch.
-    top = 2 * (0.5 * z + 8.0 * np.cbrt(z) + 10.0).astype(int)
-    order = np.arange(top.max() + 2)[:, None]
-    bessel = np.where(order <= top, special.jv(order, z), 0.0)
+    bessel = _bessel(z)
     even, odd = bessel[0::2], bessel[1::2]
     before = np.concatenate([-odd[:1], odd[:-1]])  # J_-1 = -J_1
     odd_sums = np.cumsum(odd[::-1], axis=0)[::-1]
@@ -174,8 +169,33 @@ def coefficients(frequency: np.ndarray, time: np.ndarray, tolerance: float) -> n
     sizes = np.abs(table) * np.stack([np.ones_like(z), frequency, 1 / frequency])[:, None]
     left_out = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1].max(0)
     table = np.where(left_out > tolerance, table, 0.0)
-    table[:, 0] = np.stack([np.ones_like(z), time, np.zeros_like(z)]) - table[:, 1:].sum(1)
+    rest = np.cumsum(table[:, :0:-1], axis=1)[:, -1]  # in the same order in any batch, unlike a sum
+    table[:, 0] = np.stack([np.ones_like(z), time, np.zeros_like(z)]) - rest
     return table[:, : (left_out > tolerance).sum(0).max()]
+
+
+def _bessel(z: np.ndarray) -> np.ndarray:
+    """J_0 to an odd order of each z by downward recurrence (Miller), (order, realization), good to 2e-16.
+
+    (SciPy's values are good to 4e-15 at z = 256, and some hundred are summed.) The recurrence starts where J is below
+    1e-25 by Kapteyn's inequality (DLMF, Section 10.14), at its own order for each z so that a batch does not matter, and
+    J_0 + 2 J_2 + 2 J_4 + ... = 1 gives the factor.
+    """
+    tiny = z < 1e-6
+    top = 2 * (0.5 * z + 8.0 * np.cbrt(z) + 10.0).astype(int)
+    ratio = 2 / np.where(tiny, 1.0, z)
+    values = np.zeros((top.max() + 2, len(z)))
+    above, here, norm = np.zeros((3, len(z)))
+    for order in range(top.max(), 0, -1):
+        here = np.where(order == top, 1e-280, here)
+        values[order] = here
+        norm = norm + 2 * here if order % 2 == 0 else norm
+        above, here = here, order * ratio * here - above
+    values[0] = here
+    values /= here + norm
+    series = np.zeros_like(values)
+    series[:3] = 1 - z * z / 4, z / 2, z * z / 8  # the next terms are below 1e-18 of the size of these
+    return np.where(tiny, series, values)
 
 
 def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> Advance:

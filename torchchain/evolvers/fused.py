@@ -23,6 +23,7 @@ from torchchain.chain import Chain
 from torchchain.evolvers import start
 from torchchain.evolvers.chebyshev import ROUNDING, CompiledAdvance
 from torchchain.excitation import State
+from torchchain.threads import map_in_order
 
 # Bytes of one field that a thread takes from the stencil through the transform at a time: what it holds stays in cache.
 _BLOCK = 2**19
@@ -129,7 +130,8 @@ def band_energy(
     march = stencil.March(rows, mirrored=True)
     bands, totals = np.empty((rows.count, len(steps), n_bands)), np.empty((rows.count, len(steps)))
 
-    def work(begin: int, end: int) -> None:
+    def work(part: tuple[int, int]) -> None:
+        begin, end = part
         buffer = torch.empty(count * size * window * n, dtype=torch.float64)
         for low in range(begin, end, size):
             high = min(low + size, end)
@@ -143,7 +145,9 @@ def band_energy(
                 here = slice(low, high), slice(first, last)
                 stencil.bin_spectra(a, b, c, d, kind, strain, normalize, bands[here], totals[here])
 
-    stencil.share(work, rows.count)
+    workers = min(torch.get_num_threads(), rows.count)
+    for _ in map_in_order(work, stencil.ranges(rows.count, workers), workers):
+        pass
     shape = (*state.displacement.shape[:-1], len(steps))
     if normalize:
         total = torch.from_numpy(totals).reshape(shape)

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -35,7 +36,6 @@ import torch
 from numba import njit
 
 from torchchain.evolvers.chebyshev import LEAP
-from torchchain.threads import map_in_order
 
 # What a march leaves behind at every output time; the fields are those whose transforms make the energy of a
 # wavenumber. Kinds 3 and up write as many fields as they name.
@@ -581,16 +581,20 @@ def march(
             u[j] = (4 + _RING + 2 * j) * stride + _PAD
             v[j] = u[j] + stride
         w[u[0] : u[0] + n], w[v[0] : v[0] + n] = anchors[r, 0], anchors[r, 1]
-        w[u[1] : u[1] + n], w[v[1] : v[1] + n] = latest[r, 0], latest[r, 1]
         anchor, since = clock[r, 0], int(clock[r, 1])
-        when[0], when[1] = anchor, clock[r, 2]
+        when[:] = -np.inf
+        when[0] = anchor
+        here = 0  # the row that holds the latest state
+        if since > 0:  # in the last row, which no other time of this segment will need
+            here = LONGEST
+            w[u[here] : u[here] + n], w[v[here] : v[here] + n] = latest[r, 0], latest[r, 1]
+            when[here] = clock[r, 2]
         if clock[r, 3] < 0:
             clock[r, 3] = _start_energy(w, row, u[0], v[0])
         limit = TRIM * TRIM * clock[r, 3]
         low, high = _trim(w, row, u[:1], v[:1], 1, stiff, limit, 0, n)
         start, stop = 0, n
         reference = 0.5 * (low + 1 + high)
-        here = min(since, 1)  # the row that holds the latest state
         history = 0  # states on the grid before the anchor, in rows 1, 2, ...
         age = 0  # mirrored segments since the last plain one
         i = 0
@@ -752,10 +756,21 @@ class March:
         )  # fmt: skip
 
 
-def share(work: Callable[[int, int], None], count: int) -> None:
-    """Runs work(begin, end) over rows 0 to count - 1 side by side, a few ranges of them for each of torch's threads."""
-    workers = min(torch.get_num_threads(), count)
+def ranges(count: int, workers: int) -> list[tuple[int, int]]:
+    """Rows 0 to count - 1 as a few ranges (begin, end) for each worker."""
     size = -(-count // (4 * workers if workers > 1 else 1))
-    ranges = [(begin, min(begin + size, count)) for begin in range(0, count, size)]
-    for _ in map_in_order(lambda part: work(*part), ranges, workers):
-        pass
+    return [(begin, min(begin + size, count)) for begin in range(0, count, size)]
+
+
+def share(work: Callable[[int, int], None], count: int) -> None:
+    """Runs work(begin, end) over rows 0 to count - 1 side by side, on as many threads as torch uses.
+
+    For work without torch operations, whose number of threads is left alone: setting it, as
+    :func:`torchchain.threads.map_in_order` must, makes later small operations slow beside a busy process.
+    """
+    workers = min(torch.get_num_threads(), count)
+    if workers == 1:
+        work(0, count)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(lambda part: work(*part), ranges(count, workers)))

@@ -1,0 +1,222 @@
+"""Speed of the stencil: a bare recursion, the Chebyshev kernels and eager torch; an impulse by the kernels and by modes."""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import harness
+import numpy as np
+import torch
+import xarray
+from matplotlib.figure import Figure
+from numba import njit
+
+import torchchain as tc
+from torchchain.evolvers import chebyshev, fused, start, stencil
+from torchchain.threads import single_thread
+
+
+@dataclass(frozen=True)
+class Config:
+    """Lengths for the rates, and the paper's impulse beside the wall of a long chain."""
+
+    seed: int = 0
+    """seed of the ensemble"""
+    lengths: tuple[int, ...] = (64, 256, 1024, 4096)
+    """particles per chain for the rates"""
+    updates: float = 4e7
+    """stencil updates per timed run of the kernels; eager torch makes a tenth"""
+    n_particles: int = 1024
+    """particles per chain for the impulse"""
+    strength: float = 0.1
+    """disorder xi"""
+    stop: float = 1024.0
+    """last time; the step is 1"""
+    realizations: int = 32
+    """chains by the kernels"""
+    modes_realizations: int = 4
+    """chains by modes"""
+    repeats: int = 7
+    """timed runs of each way, after one that is not counted"""
+
+
+SMOKE = Config(
+    lengths=(64, 256), updates=4e5, n_particles=64, stop=32.0, realizations=2, modes_realizations=2, repeats=2
+)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def bare(older, old, weight, n, pairs):  # type: ignore[no-untyped-def]
+    """T_k+1 = 2 x T_k - T_k-1 in place, 2 * pairs times, on n particles between two resting ones, and nothing else."""
+    for _ in range(pairs):
+        for p in range(1, n + 1):
+            x = old[p]
+            older[p] = weight[p] * ((old[p - 1] - x) + (old[p + 1] - x)) + (2.0 * x - older[p])
+        for p in range(1, n + 1):
+            x = older[p]
+            old[p] = weight[p] * ((older[p - 1] - x) + (older[p + 1] - x)) + (2.0 * x - old[p])
+
+
+def in_turn(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+    """Seconds of each run, the ways one after the other so that a slow spell of the machine meets them all."""
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for repeat in range(repeats + 1):
+        for name, way in ways.items():
+            begin = time.perf_counter()
+            way()
+            if repeat:
+                seconds[name].append(time.perf_counter() - begin)
+    return seconds
+
+
+def rates(config: Config, n: int) -> dict[str, list[float]]:
+    """Stencil updates per second on one core, each run of each way."""
+    masses = tc.Disorder(strength=config.strength).masses(n, 1, config.seed)
+    chain = tc.Chain(masses, "fixed")
+    # A start of displacement and velocity everywhere, carried over one long time: every stencil is full.
+    generator = torch.Generator().manual_seed(config.seed)
+    state = tc.State(*(torch.randn(1, n, generator=generator, dtype=torch.float64) for _ in range(2)))
+    frequency = chebyshev.highest_frequency(chain).item()
+    scratch = np.empty((3, 1000)), np.empty(1000)
+    terms = stencil._coefficients(frequency, chebyshev.LEAP / frequency, chebyshev.ROUNDING, scratch[1], *scratch[0])
+    leaps = max(1, round(config.updates / (2 * terms * n)))
+    long = torch.tensor([leaps * chebyshev.LEAP / frequency * (1 - 1e-9)], dtype=torch.float64)
+    tenth = max(1, leaps // 10)
+    short = long * (tenth / leaps)
+    pairs = leaps * terms
+    rows = np.zeros((2, n + 2))
+    rows[:, 1:-1] = state.velocity.numpy()
+    weight = np.zeros(n + 2)
+    weight[1:-1] = 4 / (frequency**2 * masses[0].numpy())
+    options = {"accuracy": chebyshev.ROUNDING}
+    ways = {
+        "bare": lambda: bare(rows[0], rows[1], weight, n, pairs),
+        "kernels": lambda: start(chain, state, "chebyshev", **options)(long),
+        "eager torch": lambda: start(chain, state, "chebyshev", compiled=False, **options)(short),
+    }
+    updates = {"bare": 2 * pairs * n, "kernels": 2 * leaps * terms * n, "eager torch": 2 * tenth * terms * n}
+    with single_thread():
+        return {name: [updates[name] / t for t in times] for name, times in in_turn(ways, config.repeats).items()}
+
+
+def measure(config: Config, device: str) -> xarray.Dataset:
+    speed = [rates(config, n) for n in config.lengths]
+    kinds = list(speed[0])
+    disorder = tc.Disorder(strength=config.strength)
+    masses = disorder.masses(config.n_particles, max(config.realizations, config.modes_realizations), config.seed)
+    many = tc.Chain(masses[: config.realizations].to(device), "fixed")
+    few = tc.Chain(masses[: config.modes_realizations].to(device), "fixed")
+    times = torch.arange(config.stop + 1, dtype=torch.float64, device=device)
+    found: dict[str, list[torch.Tensor]] = {}
+
+    def kernels() -> None:
+        moments = fused.energy_moments(many, tc.impulse(many), times)
+        found["kernels"] = [x[: config.modes_realizations].cpu() for x in (moments.center, moments.width)]
+
+    def modes() -> None:
+        energy = tc.particle_energy(few, tc.evolve(few, tc.impulse(few), times, "modes"))
+        found["modes"] = [tc.energy_center(energy).cpu(), tc.energy_width(energy).cpu()]
+
+    seconds = in_turn({"kernels": kernels, "modes": modes}, config.repeats)
+    chains = {"kernels": config.realizations, "modes": config.modes_realizations}
+    shared = min(chains.values())
+    (center, width), (modal_center, modal_width) = found["kernels"], found["modes"]
+    # The width starts from zero: relative to it from the first output after the start.
+    errors = [
+        (center[:shared] / modal_center[:shared] - 1).abs().max().item(),
+        (width[:shared, 1:] / modal_width[:shared, 1:] - 1).abs().max().item(),
+    ]
+    return xarray.Dataset(
+        {
+            "rate": (
+                ("particles", "kind", "repeat"),
+                np.array([[one[kind] for kind in kinds] for one in speed]),
+                {"units": "1/s", "long_name": "stencil updates per second and core"},
+            ),
+            "impulse": (
+                ("way", "repeat"),
+                np.array([[t / chains[way] for t in seconds[way]] for way in seconds]),
+                {"units": "s", "long_name": "seconds per chain, all cores"},
+            ),
+            "error": (("quantity",), errors, {"long_name": "largest relative difference between the ways"}),
+        },
+        coords={
+            "particles": list(config.lengths),
+            "kind": kinds,
+            "way": list(seconds),
+            "quantity": ["center R", "width r^2"],
+        },
+    )
+
+
+def compare(data: xarray.Dataset, config: Config) -> list[harness.Row]:
+    rows = []
+    for n in config.lengths:
+        rate = data.rate.sel(particles=n)
+        for kind in data.kind.values:
+            values = rate.sel(kind=kind).values / 1e9
+            note = (
+                ""
+                if kind == "bare"
+                else f"{statistics.median(rate.sel(kind='bare').values / 1e9 / values):.1f} times slower than bare"
+            )
+            rows.append(harness.Row(f"N = {n}, {kind}: 1e9 updates / s", statistics.median(values), note=note))
+    for way in data.way.values:
+        values = data.impulse.sel(way=way).values * 1e3
+        rows.append(
+            harness.Row(
+                f"impulse, {way}: ms per chain",
+                statistics.median(values),
+                note=f"{values.min():.3g} to {values.max():.3g}",
+            )
+        )
+    medians = data.impulse.median("repeat")
+    rows.append(harness.Row("impulse, modes / kernels", float(medians.sel(way="modes") / medians.sel(way="kernels"))))
+    for quantity in data.quantity.values:
+        rows.append(
+            harness.Row(f"impulse, {quantity}: largest relative difference", float(data.error.sel(quantity=quantity)))
+        )
+    return rows
+
+
+def draw(data: xarray.Dataset, config: Config) -> Figure:
+    figure, ((left, right),) = harness.panels(1, 2)
+    for kind in data.kind.values:
+        rate = data.rate.sel(kind=kind) / 1e9
+        left.plot(data.particles, rate.median("repeat"), "o-", label=kind)
+        left.fill_between(data.particles, rate.min("repeat"), rate.max("repeat"), alpha=0.2)
+    left.set(xscale="log", yscale="log", xlabel="particles N", ylabel="$10^9$ stencil updates / s, one core")
+    left.legend()
+    medians = data.impulse.median("repeat") * 1e3
+    bars = right.bar(data.way.values, medians)
+    right.bar_label(bars, fmt="%.3g")
+    right.set(
+        yscale="log",
+        ylabel="ms per chain, all cores",
+        title=f"R and r² of an impulse, N = {config.n_particles}, {int(config.stop) + 1} times",
+    )
+    return figure
+
+
+def explain(data: xarray.Dataset, config: Config) -> str:
+    return (
+        "bare: the three-term recursion alone, in place. kernels: the same with what makes it a solution, the sums for\n"
+        "displacement and velocity (four per update) and the rest of a call. eager torch: the same in plain tensor operations,\n"
+        "one chain at a time. impulse: center and width of the energy after a kick at site 1, by torchchain.evolvers.fused\n"
+        "and by batched eigen-decomposition, modal sums and particle_energy."
+    )
+
+
+SCRIPT = harness.Script("stencil_rates", Config(), SMOKE, measure, draw, compare, explain)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    return harness.run(SCRIPT, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
