@@ -128,7 +128,7 @@ def test_windows_and_chunks_are_as_small_as_the_budget(monkeypatch):
         return {}
 
     assert [first for first, _ in stream(scene, measure, "modes", memory_budget=1)] == [0, 1, 2, 3, 4]
-    assert seen == [(i, 1) for i in range(5) for _ in range(4)]
+    assert sorted(seen) == [(i, 1) for i in range(5) for _ in range(4)]  # chunks run side by side
 
 
 @pytest.mark.parametrize("threads", [2, 3])
