@@ -26,7 +26,7 @@ from torchchain.modal_bands import modal_band_energy
 from torchchain.scene import Scene
 from torchchain.spectrum import NormalModes, normal_modes
 from torchchain.statistics import Moments, MomentTree
-from torchchain.threads import map_in_order
+from torchchain.threads import map_in_order, single_thread
 from torchchain.wavenumber import band_energy, long_time_band_energy, wavenumber_energy
 
 MEMORY_BUDGET = 2**29
@@ -314,8 +314,9 @@ def simulate(
         with stages("statistics"):
             for name, tree in trees.items():
                 tree.add(first, measured[name])
-    masses = realized_masses(trees.pop("mass_moments").result())
-    return _dataset(scene, {name: tree.result() for name, tree in trees.items()}, masses)
+    with single_thread():
+        masses = realized_masses(trees.pop("mass_moments").result())
+        return _dataset(scene, {name: tree.result() for name, tree in trees.items()}, masses)
 
 
 def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, Any]) -> xarray.Dataset:
@@ -516,6 +517,14 @@ def band_transfer(
                     in_time.add(begin - edges[block], values[part])
                     if long_time:
                         at_end.add(begin - edges[block], measured["long_time"][part])
+    with single_thread():
+        return _transfer(scene, trees, long_time, realized_masses(masses.result()))
+
+
+def _transfer(
+    scene: Scene, trees: list[tuple[MomentTree, MomentTree]], long_time: bool, attributes: dict[str, float]
+) -> BandTransfer:
+    """The BandTransfer of the blocks' moments in time and at infinite time."""
     blocks = [in_time.result() for in_time, _ in trees]
     total = _merged(blocks)
     ends = [at_end.result() for _, at_end in trees] if long_time else []
@@ -530,7 +539,7 @@ def band_transfer(
         torch.stack([block.mean for block in blocks]),
         torch.stack([block.mean for block in ends]) if ends else None,
         tuple(block.count for block in blocks),
-        realized_masses(masses.result()),
+        attributes,
     )
 
 
