@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import harness
@@ -45,9 +45,13 @@ class Config:
     """and shorter ones, for the growth with time"""
     span_particles: int = 100_000
     """chain of the shorter ones"""
+    fresh: bool = True
+    """each run in a process of its own; without, memory is the peak of all runs so far"""
 
 
-SMOKE = Config(particles=(1_000,), tridiagonal=(64,), modes=(64,), stop=20.0, spans=(20.0,), span_particles=1_000)
+SMOKE = Config(
+    particles=(1_000,), tridiagonal=(64,), modes=(64,), stop=20.0, spans=(10.0,), span_particles=1_000, fresh=False
+)
 
 
 @dataclass(frozen=True)
@@ -98,28 +102,35 @@ def evolve(case: Case) -> dict[str, float]:
     return {"seconds": seconds, "cpu_seconds": cpu, "energy_error": drift, "highest_frequency": highest}
 
 
+def measured(case: Case) -> dict[str, float]:
+    """Time and memory of a case, in this process."""
+    evolve(replace(case, n_particles=64, stop=10.0))  # compile and load first
+    base = peak_memory()
+    return evolve(case) | {"base_memory": base, "memory": peak_memory()}
+
+
 def work() -> None:
     """In a process of its own: a case from standard input, its measurements to standard output."""
     torch.set_num_threads(1)
-    case = Case(**json.load(sys.stdin))
-    evolve(Case(case.method, case.start, 64, 10.0, case.strength, case.seed))  # compile and load first
-    base = peak_memory()
-    measured = evolve(case)
-    print(json.dumps(measured | {"base_memory": base, "memory": peak_memory()}))
+    print(json.dumps(measured(Case(**json.load(sys.stdin)))))
+
+
+def apart(case: Case) -> dict[str, float]:
+    """Time and memory of a case, in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import growth; growth.work()"],
+        input=json.dumps(asdict(case)), text=True, capture_output=True, cwd=Path(__file__).parent, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise RuntimeError(f"{case} failed: {done.stderr[-2000:]}")
+    return json.loads(done.stdout)
 
 
 def measure(config: Config, device: str) -> xarray.Dataset:
     if device != "cpu":
         raise checks.fail("device", "be 'cpu', whose time and memory this experiment measures", repr(device))
-    chosen, found = list(dict.fromkeys(cases(config))), []
-    for case in chosen:
-        done = subprocess.run(
-            [sys.executable, "-c", "import growth; growth.work()"], input=json.dumps(asdict(case)), text=True, capture_output=True,
-            cwd=Path(__file__).parent, check=False,
-        )  # fmt: skip
-        if done.returncode:
-            raise RuntimeError(f"{case} failed: {done.stderr[-2000:]}")
-        found.append(json.loads(done.stdout))
+    chosen = list(dict.fromkeys(cases(config)))
+    found = [apart(case) if config.fresh else measured(case) for case in chosen]
     units = {
         "seconds": "s",
         "cpu_seconds": "s",
@@ -183,7 +194,10 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     axes[0, 2].set_xticks([], minor=True)
     for ax in axes[0]:
         ax.legend(fontsize="small")
-    figure.suptitle(f"$\\xi$ = {config.strength:g}, one thread, each run in a process of its own", fontsize="medium")
+    figure.suptitle(
+        f"$\\xi$ = {config.strength:g}, one thread{', each run in a process of its own' if config.fresh else ''}",
+        fontsize="medium",
+    )
     return figure
 
 
