@@ -211,7 +211,11 @@ def _words(given: dict[str, Any]) -> list[str]:
     """The keys of a config file as flags."""
     words: list[str] = []
     for key, value in given.items():
-        words += [f"--{key.replace('_', '-')}", *(str(v) for v in (value if isinstance(value, list) else [value]))]
+        flag = key.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+            continue
+        words += [f"--{flag}", *(str(v) for v in (value if isinstance(value, list) else [value]))]
     return words
 
 

