@@ -126,6 +126,18 @@ def test_binary_values():
     assert abs((values == 0.7).mean() - 0.5) < 4 * 0.5 / np.sqrt(MANY)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_rarest_draws(kind):
+    # The smallest and the largest number that 53 random bits give, which no sample will show.
+    for lower in np.linspace(0.01, 0.65, 40):
+        for xi in (0.3, 3.0):
+            if kind == "binary" and xi > 1 - lower:
+                continue
+            ends = tc.Disorder(kind, xi, lower)._quantile(np.array([0.0, 2.0**-54, 1 - 2.0**-53, 1.0]))
+            assert np.isfinite(ends).all()
+            assert ends.min() >= lower
+
+
 @pytest.mark.parametrize("xi", [0.0, 1e-300, 1e-200, 1e-20])
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_disorder(kind, xi):

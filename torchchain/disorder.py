@@ -90,7 +90,8 @@ class Disorder:
         if xi < _NEGLIGIBLE:
             return np.ones_like(uniform)
         below = self.redrawn_fraction
-        uniform = below + (1 - below) * uniform
+        # Rounding must not reach 1, whose quantile is infinite.
+        uniform = np.minimum(below + (1 - below) * uniform, 1 - 2.0**-53)
         if self.kind == "normal":
             values = 1 + xi * special.ndtri(uniform)
         elif self.kind == "uniform":

@@ -12,7 +12,7 @@ The times are crossed in *segments*; see :data:`LEAP`. The sums leave out coeffi
 accuracy / 1024, or half an ulp where that is larger, in each segment. As |T_k(x)| <= 1 on the spectrum, what is left
 out is at most that share of the state's size, sqrt(W^2 |u|^2 + |v|^2) in the norm of Eq. 18, and since the motion
 conserves energy these shares add up at worst: the truncation stays below ``accuracy`` for 1024 segments. Rounding
-errors come on top; they are 1e-13 after hundreds of units of time.
+errors come on top: against 40 digits, some 1e-14 at t = 50 and 1e-13 to 1e-11 at t = 1000.
 
 This file holds the plain torch implementation: the reference, for any device and for gradients. On the CPU the Numba
 kernels of :mod:`stencil` do the same.
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 # few, while rounding errors of the recursion grow with its degree.
 LEAP = 256.0
 SEGMENTS = 1024
+SWEEPS = 8  # of the bound's power iteration: within 2 % of the highest frequency, or of 30 sweeps
 ROUNDING = 2.0**-53
 
 
@@ -66,10 +67,9 @@ def start(
             "be False for tensors off the CPU, that require gradients, or that are neither float32 nor float64",
             compiled,
         )
-    frequency = highest_frequency(chain, bound)
-    return (
-        CompiledAdvance(chain, state, frequency, tolerance) if compiled else _plain(chain, state, frequency, tolerance)
-    )
+    if compiled:
+        return CompiledAdvance(chain, state, bound, tolerance)
+    return _plain(chain, state, highest_frequency(chain, bound), tolerance)
 
 
 def _compilable(chain: Chain, state: State) -> bool:
@@ -94,26 +94,35 @@ def highest_frequency(chain: Chain, bound: float | Tensor | None = None) -> Tens
         FieldError: if a squared frequency exceeds the ``bound``.
     """
     with torch.no_grad():
-        if bound is None:
-            squared = chain.squared_frequency_bound(sweeps=8).to(torch.float64)
-        else:
-            squared = checks.real_tensor("bound", bound).to(chain.masses.device, torch.float64)
-            checks.first_bad("bound", "be positive", squared, squared <= 0)
-            if squared.shape not in (torch.Size(), chain.batch_shape):
-                raise checks.fail(
-                    "bound", f"be a number or have shape {tuple(chain.batch_shape)}", f"shape {tuple(squared.shape)}"
-                )
-            squared = squared.expand(chain.batch_shape)
-            checks.first_bad(
-                "bound",
-                "not lie below the largest squared frequency (chain.squared_frequency_bound() never does)",
-                squared,
-                _exceeded(chain, squared),
-                "chain",
-            )
-        # Rounded up to 24 bits, so that W^2 and most W t are exact and the operator and its time fit to the last bit.
-        mantissa, exponent = torch.frexp(squared.sqrt())
-        return torch.ldexp((mantissa * 2**24).ceil() / 2**24, exponent)
+        squared = (
+            chain.squared_frequency_bound(SWEEPS).to(torch.float64) if bound is None else _checked_bound(chain, bound)
+        )
+        return torch.as_tensor(_rounded_up(squared.sqrt().cpu().numpy()), device=squared.device)
+
+
+def _rounded_up(frequency: np.ndarray) -> np.ndarray:
+    """Rounded up to 24 bits: W^2 and most W t are exact then, and the operator and its time fit to the last bit."""
+    mantissa, exponent = np.frexp(frequency)
+    return np.ldexp(np.ceil(mantissa * 2**24) / 2**24, exponent)
+
+
+def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
+    """A user's bound of the squared frequency, (*batch,), float64; see :func:`highest_frequency`."""
+    squared = checks.real_tensor("bound", bound).to(chain.masses.device, torch.float64)
+    checks.first_bad("bound", "be positive", squared, squared <= 0)
+    if squared.shape not in (torch.Size(), chain.batch_shape):
+        raise checks.fail(
+            "bound", f"be a number or have shape {tuple(chain.batch_shape)}", f"shape {tuple(squared.shape)}"
+        )
+    squared = squared.expand(chain.batch_shape)
+    checks.first_bad(
+        "bound",
+        "not lie below the largest squared frequency (chain.squared_frequency_bound() never does)",
+        squared,
+        _exceeded(chain, squared),
+        "chain",
+    )
+    return squared
 
 
 def _exceeded(chain: Chain, squared: Tensor) -> Tensor:
@@ -250,7 +259,7 @@ def _later(times: Tensor, now: float) -> Tensor:
 class CompiledAdvance:
     """The expansion by the kernels of :mod:`stencil`, in float64 whatever the dtype of the state."""
 
-    def __init__(self, chain: Chain, state: State, frequency: Tensor, tolerance: float) -> None:
+    def __init__(self, chain: Chain, state: State, bound: float | Tensor | None, tolerance: float) -> None:
         from torchchain.evolvers import stencil  # imports Numba
 
         n = chain.n_particles
@@ -261,15 +270,24 @@ class CompiledAdvance:
         contacts = chain.contact_stiffness
         if chain.boundary == "periodic":
             contacts = torch.cat([contacts, contacts[..., :1]], dim=-1)
-        masses, displacement = plain(chain.masses), plain(state.displacement)
+        masses, displacement, springs = plain(chain.masses), plain(state.displacement), plain(contacts)
+        periodic = chain.boundary == "periodic"
+        squared = np.empty(len(masses))
+        if bound is None:
+            stencil.share(
+                lambda begin, end: stencil.squared_bounds(begin, end, masses, springs, periodic, SWEEPS, squared),
+                len(masses),
+            )
+        else:
+            squared[:] = _checked_bound(chain, bound).reshape(-1).numpy()
         self.rows: Rows = stencil.Rows(
             masses=masses,
-            contacts=plain(contacts),
-            frequencies=frequency.reshape(-1).numpy(),
+            contacts=springs,
+            frequencies=_rounded_up(np.sqrt(squared)),
             displacement=displacement,
             velocity=plain(state.velocity),
             starts=len(displacement) // len(masses),
-            periodic=chain.boundary == "periodic",
+            periodic=periodic,
             tolerance=tolerance,
         )
         self._march = stencil.March(self.rows)

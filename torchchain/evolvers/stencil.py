@@ -647,6 +647,37 @@ def march(
         clock[r, 0], clock[r, 1], clock[r, 2] = anchor, since, times[steps - 1]
 
 
+@_kernel
+def squared_bounds(begin, end, masses, contacts, periodic, sweeps, bounds):
+    """``Chain.squared_frequency_bound`` of realizations begin to end - 1.
+
+    Args:
+        begin, end: realizations.
+        masses, contacts, periodic: see :func:`march`.
+        sweeps: of the bound's power iteration.
+        bounds: (realization,), written.
+    """
+    n = masses.shape[1]
+    x, image = np.empty(n + 2), np.empty(n)
+    for r in range(begin, end):
+        x[:] = 1.0
+        largest = 0.0
+        for _ in range(sweeps + 1):
+            x[0] = x[n] if periodic else 0.0
+            x[n + 1] = x[1] if periodic else 0.0
+            largest, top = 0.0, 0.0
+            for p in range(n):
+                here = x[p + 1]
+                sums = contacts[r, p] * (here + x[p]) + contacts[r, p + 1] * (here + x[p + 2])
+                value = sums / masses[r, p]
+                largest = max(largest, value / here)
+                image[p] = math.sqrt(here * value)
+                top = max(top, image[p])
+            for p in range(n):
+                x[p + 1] = max(image[p] / top, 1e-77)
+        bounds[r] = largest * (1 + 1.8e-15)
+
+
 @_summing_kernel
 def bin_spectra(a, b, c, d, kind, strain, normalize, bands, totals):
     """Energies of wavenumbers (Eq. 43) summed into bands (Eq. 44).
