@@ -111,7 +111,7 @@ def each_realization_of_ring(scene: tc.Scene, device: str) -> dict[str, Tensor]:
     )
     for _, values in measured:
         for name, part in parts.items():
-            part.append(values[name])
+            part.append(values[name].cpu())
     return {name: torch.cat(part) for name, part in parts.items()}
 
 

@@ -71,7 +71,7 @@ def each_realization(scene: tc.Scene, method: str, device: str) -> dict[str, Ten
     parts: dict[str, list[Tensor]] = {name: [] for name in scene.observables}
     for _, measured in ensemble.stream(scene, lambda chunk: chunk.observe(scene.observables), method, device=device):
         for name, values in parts.items():
-            values.append(measured[name])
+            values.append(measured[name].cpu())
     return {name: torch.cat(values) for name, values in parts.items()}
 
 

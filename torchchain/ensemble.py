@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,10 +25,11 @@ from torchchain.excitation import Impulse, StandingWave, State
 from torchchain.modal_bands import modal_band_energy
 from torchchain.scene import Scene
 from torchchain.spectrum import NormalModes, normal_modes
-from torchchain.statistics import Moments, MomentTree
+from torchchain.statistics import EnsembleMoments, Moments, merged
 from torchchain.threads import map_in_order, single_thread
 from torchchain.wavenumber import band_energy, long_time_band_energy, wavenumber_energy
 
+Measured = TypeVar("Measured")
 MEMORY_BUDGET = 2**29
 CACHE_FRIENDLY = 2**25  # states of a chunk beyond this size cost more per byte: page faults
 BLOCKS = 20
@@ -168,7 +169,7 @@ class Chunk:
 
 def stream(
     scene: Scene,
-    measure: Callable[[Chunk], dict[str, Tensor]],
+    measure: Callable[[Chunk], Measured],
     method: str = "auto",
     *,
     device: str | torch.device = "cpu",
@@ -176,7 +177,7 @@ def stream(
     progress: bool = False,
     stages: Stages | None = None,
     options: dict[str, Any] | None = None,
-) -> Iterator[tuple[int, dict[str, Tensor]]]:
+) -> Iterator[tuple[int, Measured]]:
     """Measure the realizations of a scene in chunks that keep to a memory budget, in order.
 
     An ordered scene is one chain however many realizations it asks for, and that one is measured alone. On the CPU
@@ -184,7 +185,7 @@ def stream(
 
     Args:
         scene: what is wanted.
-        measure: from a chunk to named tensors (realization, ...); called on several threads.
+        measure: from a chunk to whatever is wanted of it; called on several threads.
         method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
         device: where the chains are computed.
         memory_budget: bytes for all chunks under way; times are cut into windows where one chain exceeds it.
@@ -193,8 +194,7 @@ def stream(
         options: the method's own.
 
     Yields:
-        The first realization of the chunk, counted from 0, and its measurements on the CPU, with the masses'
-        first two moments under "mass_moments".
+        The first realization of the chunk, counted from 0, and what was measured.
     """
     options = dict(options or {})
     checks.choice("method", method, ("auto", *METHODS))
@@ -210,15 +210,13 @@ def stream(
     window, size = _chunking(scene, method, realizations, workers, budget // workers)
     times = scene.times.to(device)
 
-    def work(numbers: range) -> tuple[range, dict[str, Tensor], dict[str, float]]:
+    def work(numbers: range) -> tuple[range, Measured, dict[str, float]]:
         spent = Stages(1 / workers)
         with spent("masses"):
             chain = scene.chain(numbers, device)
             state = scene.state(chain)
         measured = measure(Chunk(scene, numbers[0], chain, state, method, options, times, window, spent))
-        moments = torch.stack([chain.masses.mean(-1), chain.masses.square().mean(-1)], dim=-1)
-        measured = {"mass_moments": moments, **measured}
-        return numbers, {name: values.cpu() for name, values in measured.items()}, spent.seconds
+        return numbers, measured, spent.seconds
 
     chunks = [range(first, min(first + size, realizations)) for first in range(0, realizations, size)]
     with tqdm(total=realizations, unit="chain", disable=None if progress else True, leave=False) as bar:
@@ -232,8 +230,8 @@ def _chunking(scene: Scene, method: str, realizations: int, workers: int, budget
     """Times per window and realizations per chunk that keep one worker's chunk within a budget of bytes."""
     rows = max(1, len(scene.tones))
     share = -(-realizations // workers)
-    if _is_fused(method, scene.observables):  # no states are stored: a few chunks a worker, for the progress bar
-        return len(scene.times), max(1, min(-(-share // 4), budget // (8 * rows * 12 * scene.n_particles)))
+    if _is_fused(method, scene.observables):  # no states are stored: two chunks a worker, for the progress bar
+        return len(scene.times), max(1, min(-(-share // 2), budget // (8 * rows * 12 * scene.n_particles)))
     state_bytes = 8 * rows * scene.n_particles * 10  # states, phases, transforms, products
     mode_bytes = 8 * scene.n_particles**2 * 8 if method == "modes" else 0
     window = max(1, min(len(scene.times), min(budget - mode_bytes, CACHE_FRIENDLY) // state_bytes))
@@ -263,9 +261,43 @@ def check_amplitude(scene: Scene) -> None:
     warn_if_nonlinear(chain, state, stacklevel=4)
 
 
-def realized_masses(moments: Moments) -> dict[str, float]:
+def ensemble_moments(
+    scene: Scene,
+    measure: Callable[[Chunk], dict[str, Tensor]],
+    method: str = "auto",
+    n_blocks: int = 1,
+    *,
+    stages: Stages | None = None,
+    **settings: Any,
+) -> EnsembleMoments:
+    """Moments over an ensemble of named measurements (realization, ...), and of the masses under "mass_moments".
+
+    Args:
+        scene, measure, method, stages, settings: see :func:`stream`.
+        n_blocks: of consecutive realizations whose moments are kept apart.
+    """
+    realizations = 1 if scene.is_ordered else scene.realizations
+    total = EnsembleMoments(realizations, n_blocks)
+    stages = stages or Stages()
+
+    def reduced(chunk: Chunk) -> EnsembleMoments:
+        measured = {name: values.cpu() for name, values in measure(chunk).items()}
+        masses = chunk.chain.masses.cpu()
+        measured["mass_moments"] = torch.stack([masses.mean(-1), masses.square().mean(-1)], dim=-1)
+        part = EnsembleMoments(realizations, n_blocks)
+        with chunk.stages("statistics"):
+            part.add(chunk.first, measured)
+        return part
+
+    for _, part in stream(scene, reduced, method, stages=stages, **settings):
+        with stages("statistics"):
+            total.absorb(part)
+    return total
+
+
+def realized_masses(moments: EnsembleMoments) -> dict[str, float]:
     """``mass_mean`` and ``mass_sd`` over all particles of all realizations."""
-    mean, square = moments.mean.tolist()
+    mean, square = merged(moments.blocks("mass_moments")).mean.tolist()
     return {"mass_mean": mean, "mass_sd": max(0.0, square - mean**2) ** 0.5}
 
 
@@ -300,8 +332,7 @@ def simulate(
             measured["long_time_band_energy"] = chunk.long_time()
         return measured
 
-    trees = {name: MomentTree() for name in ("mass_moments", *scene.observables)}
-    for first, measured in stream(
+    moments = ensemble_moments(
         scene,
         measure,
         method,
@@ -310,13 +341,10 @@ def simulate(
         progress=progress,
         stages=stages,
         options=options,
-    ):
-        with stages("statistics"):
-            for name, tree in trees.items():
-                tree.add(first, measured[name])
+    )
     with single_thread():
-        masses = realized_masses(trees.pop("mass_moments").result())
-        return _dataset(scene, {name: tree.result() for name, tree in trees.items()}, masses)
+        found = {name: merged(moments.blocks(name)) for name in scene.observables}
+        return _dataset(scene, found, realized_masses(moments))
 
 
 def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, Any]) -> xarray.Dataset:
@@ -489,46 +517,32 @@ def band_transfer(
     stages = stages or Stages()
     realizations = 1 if scene.is_ordered else scene.realizations
     n_blocks = min(BLOCKS, realizations)
-    edges = [realizations * b // n_blocks for b in range(n_blocks + 1)]
-    trees = [(MomentTree(), MomentTree()) for _ in range(n_blocks)]
-    masses = MomentTree()
 
     def measure(chunk: Chunk) -> dict[str, Tensor]:
         measured = chunk.observe(["band_energy"])
         return measured | ({"long_time": chunk.long_time()} if long_time else {})
 
-    for first, measured in stream(
+    moments = ensemble_moments(
         scene,
         measure,
         method,
+        n_blocks,
         device=device,
         memory_budget=memory_budget,
         progress=progress,
         stages=stages,
         options=options,
-    ):
-        with stages("statistics"):
-            masses.add(first, measured["mass_moments"])
-            values = measured["band_energy"]
-            for block, (in_time, at_end) in enumerate(trees):
-                begin, end = max(edges[block], first), min(edges[block + 1], first + len(values))
-                if begin < end:
-                    part = slice(begin - first, end - first)
-                    in_time.add(begin - edges[block], values[part])
-                    if long_time:
-                        at_end.add(begin - edges[block], measured["long_time"][part])
-    with single_thread():
-        return _transfer(scene, trees, long_time, realized_masses(masses.result()))
+    )
+    with single_thread(), stages("statistics"):
+        return _transfer(scene, moments, long_time)
 
 
-def _transfer(
-    scene: Scene, trees: list[tuple[MomentTree, MomentTree]], long_time: bool, attributes: dict[str, float]
-) -> BandTransfer:
+def _transfer(scene: Scene, moments: EnsembleMoments, long_time: bool) -> BandTransfer:
     """The BandTransfer of the blocks' moments in time and at infinite time."""
-    blocks = [in_time.result() for in_time, _ in trees]
-    total = _merged(blocks)
-    ends = [at_end.result() for _, at_end in trees] if long_time else []
-    average_at_end = _merged(ends) if ends else None
+    blocks = moments.blocks("band_energy")
+    total = merged(blocks)
+    ends = moments.blocks("long_time") if long_time else []
+    average_at_end = merged(ends) if ends else None
     return BandTransfer(
         scene,
         scene.times,
@@ -539,15 +553,8 @@ def _transfer(
         torch.stack([block.mean for block in blocks]),
         torch.stack([block.mean for block in ends]) if ends else None,
         tuple(block.count for block in blocks),
-        attributes,
+        realized_masses(moments),
     )
-
-
-def _merged(parts: list[Moments]) -> Moments:
-    total = parts[0]
-    for part in parts[1:]:
-        total = total.merge(part)
-    return total
 
 
 def _transfer_scene(scene: Scene) -> Scene:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -84,6 +85,18 @@ class MomentTree:
             mean, squares = [m for m, _ in merged], [s for _, s in merged]
             level, start = level + 1, start // 2
 
+    def absorb(self, other: MomentTree) -> None:
+        """Take in the realizations of another tree, which is used up."""
+        self.count += other.count
+        for place, node in other.waiting.items():
+            level, start = place
+            while (sibling := self.waiting.pop((level, start ^ 1), None)) is not None:
+                left, right = (sibling, node) if start % 2 else (node, sibling)
+                node = _merge_equal(*left, *right, 2.0**level)
+                level, start = level + 1, start // 2
+            self.waiting[level, start] = node
+        other.waiting = {}
+
     def result(self) -> Moments:
         """The moments of all realizations taken in."""
         nodes = sorted(self.waiting.items(), key=lambda item: item[0][1] << item[0][0])
@@ -93,10 +106,46 @@ class MomentTree:
             Moments(2**level, mean, torch.zeros_like(mean) if squares is None else squares)
             for (level, _), (mean, squares) in nodes
         ]
-        total = parts[0]
-        for part in parts[1:]:
-            total = total.merge(part)
-        return total
+        return merged(parts)
+
+
+class EnsembleMoments:
+    """Running moments of named measurements in blocks of consecutive realizations, from any chunks in any order.
+
+    Args:
+        realizations: R, of the ensemble.
+        n_blocks: B, at most R; block b holds realizations R b / B (rounded down) to R (b + 1) / B - 1.
+    """
+
+    def __init__(self, realizations: int, n_blocks: int = 1) -> None:
+        self.edges = [realizations * block // n_blocks for block in range(n_blocks + 1)]
+        self.trees: dict[tuple[str, int], MomentTree] = {}
+
+    def add(self, first: int, measured: Mapping[str, Tensor]) -> None:
+        """Take in measurements (realization, ...) of realizations first, first + 1, ..."""
+        for name, values in measured.items():
+            for block, (low, high) in enumerate(zip(self.edges, self.edges[1:], strict=False)):
+                begin, end = max(low, first), min(high, first + len(values))
+                if begin < end:
+                    tree = self.trees.setdefault((name, block), MomentTree())
+                    tree.add(begin - low, values[begin - first : end - first])
+
+    def absorb(self, other: EnsembleMoments) -> None:
+        """Take in another part of the same ensemble, which is used up."""
+        for key, tree in other.trees.items():
+            self.trees.setdefault(key, MomentTree()).absorb(tree)
+
+    def blocks(self, name: str) -> list[Moments]:
+        """The moments of every block, in order."""
+        return [self.trees[name, block].result() for block in range(len(self.edges) - 1)]
+
+
+def merged(parts: list[Moments]) -> Moments:
+    """The moments of all parts."""
+    total = parts[0]
+    for part in parts[1:]:
+        total = total.merge(part)
+    return total
 
 
 def _merge_equal(

@@ -43,7 +43,7 @@ STATES, SITE_MOMENTS, BOND_MOMENTS, UNIFORM_FIELDS, SITE_FIELDS, BOND_FIELDS = r
 
 # A segment ends before z exceeds REACH or the outputs exceed LONGEST: the work per output, degree(z) stencils shared
 # by the segment plus two sums per output, is flat around this minimum (a sum costs a sixth of a stencil).
-REACH = 12.0
+REACH = 16.0
 LONGEST = 8
 # The mirrored form adds up rounding errors like a random walk's integral; a plain step now and then ends that.
 RESTART = 64
@@ -61,6 +61,14 @@ _summing_kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"c
 # Rows of the scratch are reached as offsets into one flat array, and indices are unsigned: signed ones make Numba
 # test for a negative index at every load, which keeps the loops from being vectorized.
 _U = np.uint64
+
+
+@_kernel
+def _aligned(size):
+    """Zeros that begin at a multiple of 64 bytes: a fifth faster than where vectors straddle cache lines."""
+    cells = np.zeros(size + 8)
+    skipped = (-(cells.ctypes.data // 8)) % 8
+    return cells[skipped : skipped + size]
 
 
 @_kernel
@@ -543,7 +551,7 @@ def march(
     n, steps = masses.shape[1], times.size
     slack = _SLACK if mirrored else 0.0
     stride = 8 * ((n + 2 * _PAD + 7) // 8)
-    w = np.zeros((4 + _RING + 2 * (LONGEST + 1)) * stride)
+    w = _aligned((4 + _RING + 2 * (LONGEST + 1)) * stride)
     ring = (4 + np.arange(_RING)) * stride + _PAD
     u = np.zeros(LONGEST + 1, np.int64)
     v = np.zeros(LONGEST + 1, np.int64)
