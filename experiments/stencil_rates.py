@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from numba import njit
 
 import torchchain as tc
-from torchchain.evolvers import chebyshev, fused, stencil
+from torchchain import fused
+from torchchain.evolvers import chebyshev, stencil
 from torchchain.threads import single_thread
 
 
@@ -222,7 +223,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
     return (
         "bare: the three-term recursion alone, in place. kernels: the same with what makes it a solution, the sums for\n"
         "displacement and velocity (two per update) and the rest of a call. eager torch: the same in plain tensor operations,\n"
-        "many chains at once. impulse: center and width of the energy after a kick at site 1, by torchchain.evolvers.fused\n"
+        "many chains at once. impulse: center and width of the energy after a kick at site 1, by tc.energy_moments\n"
         "and by batched eigen-decomposition, modal sums and particle_energy."
     )
 

@@ -97,7 +97,7 @@ def test_the_header_tells_what_a_reader_needs(tmp_path):
     master(markov()).save(path)
     header = parts(path)[0]
     assert header["format"] == "torchchain-master-equation"
-    assert header["format_version"] == 1
+    assert header["format_version"] == 2
     assert (header["strength"], header["n_bands"], header["window"]) == (0.3, B, [0.5, 2.0])
     assert header["scene"]["seed"] == 2**64 - 1
     assert {"torchchain", "torch", "numpy", "scipy", "torchdiffeq"} <= set(header["versions"])
@@ -189,10 +189,10 @@ def test_every_field_of_the_scene_is_checked(field, saved):
         ({"n_bands": 0}, "hold .* with 0 bands"),
         ({"strength": 0.2}, "state the strength of its scene, got 0.2"),
         ({"strength": float("nan")}, "state the strength of its scene"),
-        ({"format_version": 2}, "have format version 1, got 2"),
-        ({"format_version": 1.5}, "have format version 1"),
+        ({"format_version": 1}, "have format version 2, got 1"),
+        ({"format_version": 1.5}, "have format version 2"),
         ({"kind": "memory"}, "hold the tensors amplitudes"),
-        ({"kind": "torch.nn.Linear"}, "kind must be one of markov, memory"),
+        ({"kind": "torch.nn.Linear"}, "kind must be one of markov, swing_in, memory"),
         ({"conventions": {"axes": "rates[receiver, source]"}}, "follow this version's conventions"),
         ({"format": "torchchain-scene"}, "carry the format torchchain-master-equation"),
     ],
@@ -317,7 +317,7 @@ def test_tensors_of_two_precisions_are_made_one(saved):
     [
         ({"amplitudes": torch.zeros(3, 4, 4)}, "amplitudes must add up to 1 - basis at time 0"),
         ({"amplitudes": torch.zeros(2, 4, 4)}, "amplitudes must have shape"),
-        ({"amplitudes": torch.zeros(65, 4, 4)}, "hold amplitudes of shape"),
+        ({"amplitudes": torch.zeros(129, 4, 4)}, "hold amplitudes of shape"),
         ({"decay": -torch.ones(1)}, "decay must not be negative"),
         ({"pair_frequency": torch.ones(2)}, "amplitudes must have shape|pair_frequency"),
         ({"pair_decay": torch.full((1,), torch.nan)}, "pair_decay must be finite"),

@@ -127,7 +127,7 @@ def test_nonlinear_fit_of_exponentials(speed):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         master = tc.calibrate(transfer_of(mean), "nonlinear", "paper")
-    assert master.calibration.report == {"unconverged": 0, "unconverged_entries": []}
+    assert master.calibration.report == {"unconverged": 0, "unconverged_entries": [], "horizon": 30.0}
     assert master.calibration.window == (0.5, 4.5)
     # The slope at t0, per free energy; the search stops at 1e-8 relative.
     np.testing.assert_allclose(master.rates.detach().numpy() * (1 - psi())[:, None], slopes, rtol=1e-5)
@@ -270,7 +270,7 @@ def test_projection_chooses_an_order():
     transfer = transfer_of(mean, long_time=basis, noise=0.01)
     master = tc.calibrate(transfer)
     assert master.calibration.report["order"] == [1, 1]
-    assert master.calibration.report["tried"][0][0] == [1, 0]
+    assert master.calibration.report["tried"][1][:2] == ["memory", [1, 0]]
     again = tc.calibrate(transfer)
     assert torch.equal(again.model.amplitudes, master.model.amplitudes)
 

@@ -10,8 +10,9 @@ import torch
 from scipy import special
 
 import torchchain as tc
+from torchchain import fused
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.evolvers import chebyshev, fused, start
+from torchchain.evolvers import chebyshev, start
 
 BOUNDARIES = ("fixed", "periodic")
 IMPLEMENTATIONS = [pytest.param(True, id="compiled"), pytest.param(False, id="torch")]

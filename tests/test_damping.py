@@ -212,6 +212,19 @@ def test_an_open_contact_does_not_damp(name):
     assert torch.allclose(found.velocity[:, 1:3], velocity[1:3].expand(3, 2), atol=1e-14)
 
 
+def test_the_chains_damping_force_follows_the_same_rule():
+    chain = tc.Chain(torch.ones(4, dtype=torch.float64), "fixed", contact="hertz", damping=0.5)
+    displacement = torch.tensor([0.0, 1.0, 0.5, 0.5], dtype=torch.float64)  # the second contact has just opened
+    velocity = torch.tensor([0.1, 0.4, 0.2, -0.3], dtype=torch.float64)
+    assert chain.active_damping(displacement).tolist() == [0.5, 0.0, 0.5, 0.5, 0.5]
+    pull = torch.tensor([0.05, 0.0, -0.1, -0.25, 0.15], dtype=torch.float64)
+    assert torch.allclose(chain.damping_force(velocity, displacement), pull.diff(), atol=1e-15)
+    with pytest.raises(ValueError, match="displacement must be given for Hertz contacts"):
+        chain.damping_force(velocity)
+    linear = replace(chain, contact="linear")
+    assert torch.equal(linear.damping_force(velocity, displacement), linear.damping_force(velocity))
+
+
 def test_damped_collisions_by_two_unrelated_methods():
     """Hertz contacts that open while damped: the states and the energy balance of both."""
     chain = random_chain("fixed", damping=0.1, n=10, batch=())

@@ -9,7 +9,7 @@ import xarray
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.ensemble import Stages, stream
+from torchchain.ensemble import Stages, layout, stream
 from torchchain.scene import OBSERVABLES
 
 TIMES = [0.0, 0.7, 5.0, 90.0]
@@ -109,38 +109,56 @@ def equal(a, b):
 
 
 @pytest.mark.parametrize("budget", [1, 2**17, 2**20, 2**23])
-def test_memory_budget_changes_nothing(budget):
-    # From one time of one chain at once up to everything at once.
+def test_memory_budget_changes_no_bit(budget):
     scene = tc.Scene(**{**COMMON, "realizations": 11})
-    whole, cut = tc.simulate(scene, "modes"), tc.simulate(scene, "modes", memory_budget=budget)
-    for name in whole.data_vars:
-        # batched products may round differently for another number of rows, and nothing else
-        scale = abs(whole[name].values).max()
-        np.testing.assert_allclose(cut[name].values, whole[name].values, rtol=0, atol=1e-13 * scale)
+    assert equal(tc.simulate(scene, "modes"), tc.simulate(scene, "modes", memory_budget=budget))
 
 
-def test_windows_and_chunks_are_as_small_as_the_budget(monkeypatch):
-    scene = tc.Scene(**COMMON)
-    seen = []
+@pytest.mark.parametrize("method", ["modes", "chebyshev"])
+def test_what_is_multiplied_together_depends_on_the_scene_alone(method):
+    scene = tc.Scene(**{**COMMON, "realizations": 50})
+    cpu, names = torch.device("cpu"), scene.observables
+    whole = layout(scene, method, names, cpu)
+    for realizations, budget in ((50, 1), (3, None), (1, 2**20)):
+        part = layout(scene, method, names, cpu, realizations, budget)
+        assert (part.window, part.group) == (whole.window, whole.group)
+        assert part.size % part.group == 0
 
-    def measure(chunk):
-        seen.extend((chunk.first, len(part.times)) for part in chunk.trajectories())
-        return {}
 
-    assert [first for first, _ in stream(scene, measure, "modes", memory_budget=1)] == [0, 1, 2, 3, 4]
-    assert sorted(seen) == [(i, 1) for i in range(5) for _ in range(4)]  # chunks run side by side
+def test_large_states_come_in_windows_of_times():
+    scene = tc.Scene(n_particles=2**15, n_bands=1, realizations=2, times=np.arange(20.0), observables=("energy",))
+    assert 1 < layout(scene, "chebyshev", scene.observables, torch.device("cpu")).window < 20
 
 
 @pytest.mark.parametrize("threads", [2, 3])
-def test_threads_change_nothing(threads, small_scene, small_transfer):
+@pytest.mark.parametrize("method", ["modes", "chebyshev", "verlet"])
+def test_threads_change_no_bit(threads, method, small_scene):
+    options = {"step": 0.05} if method == "verlet" else None
+    one = tc.band_transfer(small_scene, method, options=options)
     torch.set_num_threads(threads)
     try:
-        other = tc.band_transfer(small_scene, "modes")
+        other = tc.band_transfer(small_scene, method, options=options)
         assert torch.get_num_threads() == threads  # what the caller has set is set again
     finally:
         torch.set_num_threads(1)
     for name in ("mean", "stderr", "long_time", "long_time_stderr", "block_mean"):
-        assert torch.allclose(getattr(other, name), getattr(small_transfer, name), rtol=0, atol=1e-13)
+        assert torch.equal(getattr(other, name), getattr(one, name))
+
+
+@pytest.mark.parametrize("cuts", [[0, 12], [0, 5, 12], [0, 1, 2, 3, 12]])
+@pytest.mark.parametrize("names", [("band_energy", "long_time_band_energy"), ("center", "width")])
+def test_chunks_of_the_stencil_change_no_bit(cuts, names, small_scene):
+    scene = replace(small_scene, observables=names)
+    numbers = [range(a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
+    in_time = [name for name in names if name != "long_time_band_energy"]
+
+    def measure(chunk):
+        return {**chunk.observe(in_time), **({"late": chunk.long_time()} if len(in_time) < len(names) else {})}
+
+    whole = [m for _, m in stream(scene, measure, "chebyshev", options={"accuracy": 1e-10})]
+    parts = [m for _, m in stream(scene, measure, "chebyshev", options={"accuracy": 1e-10}, numbers=numbers)]
+    for name in whole[0]:
+        assert torch.equal(torch.cat([m[name] for m in whole]), torch.cat([m[name] for m in parts]))
 
 
 def test_a_run_repeats_to_the_last_bit():

@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from functools import cache
 
+import mpmath  # comes with torch
 import numpy as np
 import pytest
 import torch
@@ -160,6 +161,65 @@ def test_agrees_with_modes(name):
     assert difference(trajectory, expected) < error(name) * expected.displacement.abs().max()
 
 
+@cache
+def to_thirty_digits(boundary):
+    """A chain of given masses, its start, and the states at times 50 and 1000 from its modes to 30 digits (Eqs. 19-21)."""
+    n, times = 24, (50, 1000)
+    chain = tc.Chain(tc.Disorder(strength=0.3).masses(n, 1, 0)[0], boundary)
+    state = a_state(chain)
+    drifting = (chain.masses * state.velocity).sum() / chain.masses.sum()
+    state = tc.State(state.displacement, state.velocity - drifting)  # a ring must not move away as a whole
+    with mpmath.workdps(30):
+        masses, u, v = (mpmath.matrix(x.tolist()) for x in (chain.masses, state.displacement, state.velocity))
+        root = mpmath.diag([mpmath.sqrt(b) for b in masses])
+        squared, shapes = mpmath.eigsy(root**-1 * mpmath.matrix((-chain.stiffness_matrix()).tolist()) * root**-1)
+        w = [mpmath.sqrt(max(x, mpmath.mpf(10) ** -50)) for x in squared]
+        a, b = shapes.T * root * u, shapes.T * root * v
+        found = []
+        for t in times:
+            cosine, sine = ([function(x * t) for x in w] for function in (mpmath.cos, mpmath.sin))
+            position = [a[k] * cosine[k] + b[k] * sine[k] / w[k] for k in range(n)]
+            speed = [b[k] * cosine[k] - a[k] * sine[k] * w[k] for k in range(n)]
+            found += [root**-1 * shapes * mpmath.matrix(x) for x in (position, speed)]
+    displacement, velocity = (
+        torch.tensor([[float(x) for x in field] for field in fields], dtype=torch.float64)
+        for fields in (found[0::2], found[1::2])
+    )
+    return chain, state, tc.Trajectory(torch.tensor(times, dtype=torch.float64), displacement, velocity)
+
+
+# The other methods step with an error of a lower order, which no affordable step makes as small.
+LONG = {name: {} for name in EXACT} | {"symplectic4": {"step": 1e-3}}
+
+
+@pytest.mark.parametrize(
+    ("name", "boundary"), [(name, boundary) for name in LONG for boundary in METHODS[name].boundaries]
+)
+def test_linear_methods_agree_to_twelve_digits_and_to_nine_at_time_1000(name, boundary):
+    chain, state, expected = to_thirty_digits(boundary)
+    found = tc.evolve(chain, state, expected.times, name, **LONG[name])
+    scale = expected.velocity.abs().max()
+    for i, tolerance in enumerate((1e-12, 1e-9)):
+        for field in ("displacement", "velocity"):
+            assert (getattr(found, field)[i] - getattr(expected, field)[i]).abs().max() < tolerance * scale
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_reciprocity(name):
+    """What p does at q by a push is what q does at p by the same one, damped or not."""
+    entry = METHODS[name]
+    chain = a_chain(entry.boundaries[-1], damping=0.1 if entry.damped else 0.0, batch=())
+    p, q = 2, 7
+    pushed = torch.zeros(2, chain.n_particles, dtype=torch.float64)
+    pushed[0, p], pushed[1, q] = 0.01 / chain.masses[p], 0.01 / chain.masses[q]
+    found = [
+        tc.evolve(chain, tc.State(torch.zeros_like(v), v), TIMES, name, **options(name)).displacement for v in pushed
+    ]
+    reached = found[0][:, q].abs().max()
+    assert reached > 1e-4
+    assert (found[0][:, q] - found[1][:, p]).abs().max() < max(error(name), 1e-12) * 0.05
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_two_particles(name):
     entry = METHODS[name]
@@ -202,6 +262,42 @@ def test_batch_of_two_equals_each_alone(name):
         pair = tc.Trajectory(TIMES, both.displacement[i], both.velocity[i])
         # an adaptive step is chosen for the batch as a whole
         assert difference(alone, pair) < (error(name) if name in ADAPTIVE else 1e-13) * 0.05
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize(
+    ("name", "contact", "damping"),
+    [("verlet", "linear", 0.0), ("verlet", "linear", 0.3), ("verlet", "hertz", 0.3), ("symplectic4", "hertz", 0.0)],
+)
+def test_default_steps_do_not_depend_on_the_batch(name, contact, damping, compiled):
+    """To the last bit, though the batch holds a chain that takes ten times the steps and a start of thirty times the energy."""
+    chain = a_chain("fixed", contact, damping)
+    chain = replace(chain, masses=chain.masses * torch.tensor([[1.0], [0.01]], dtype=torch.float64))
+    small = a_state(chain, members=(2,))
+    size = torch.tensor([1.0, 6.0], dtype=torch.float64)[:, None]
+    state = tc.State(size * small.displacement, (size * small.velocity).requires_grad_(not compiled))
+    both = tc.evolve(chain, state, TIMES, name)
+    for i, j in np.ndindex(2, 2):
+        one = tc.Chain(chain.masses[i], "fixed", chain.contact_stiffness[i], contact, chain.contact_damping[i])
+        alone = tc.evolve(one, tc.State(state.displacement[i, j], state.velocity[i, j]), TIMES, name)
+        assert torch.equal(alone.displacement, both.displacement[i, j])
+        assert torch.equal(alone.velocity, both.velocity[i, j])
+        if damping:
+            assert torch.equal(alone.dissipated, both.dissipated[i, j])
+        if contact == "hertz":
+            assert torch.equal(alone.openings, both.openings[i, j])
+
+
+@pytest.mark.parametrize("name", ADAPTIVE)
+def test_a_small_start_is_as_accurate_beside_a_large_one(name):
+    """The absolute error allowed is a share of each start's own size."""
+    chain = a_chain(batch=())
+    small = a_state(chain)
+    state = tc.State(*(torch.stack([x, 1e-8 * x]) for x in (small.displacement, small.velocity)))
+    found = tc.evolve(chain, state, TIMES, name, **options(name))
+    assert torch.allclose(1e8 * found.displacement[1], found.displacement[0], rtol=0, atol=0.05 * error(name))
+    expected = tc.evolve(chain, small, TIMES, "modes")
+    assert (1e8 * found.displacement[1] - expected.displacement).abs().max() < error(name) * 0.05
 
 
 @pytest.mark.parametrize(("name", "boundary", "contact", "damping"), ONE_BOUNDARY)
@@ -433,8 +529,9 @@ def test_momentum_of_a_ring_is_kept(name):
 
 
 def test_steps_land_on_the_output_times():
-    assert symplectic.substeps(0.0, [0.0, 0.1, 0.3, 0.30001, 1.0], 0.1) == [0, 1, 2, 1, 7]
-    assert symplectic.substeps(0.0, (0.1 * np.arange(1, 1001)).tolist(), 0.1) == [1] * 1000
+    assert symplectic.substeps(0.0, [0.0, 0.1, 0.3, 0.30001, 1.0], 0.1).tolist() == [0, 1, 2, 1, 7]
+    assert (symplectic.substeps(0.0, (0.1 * np.arange(1, 1001)).tolist(), 0.1) == 1).all()
+    assert symplectic.substeps(0.5, [1.0, 2.0], torch.tensor([0.5, 0.3])).tolist() == [[1, 2], [2, 4]]
 
 
 @pytest.mark.parametrize("name", [name for name in STEPPED if name not in dict(LIMITED)])

@@ -159,6 +159,15 @@ def test_collisions_agree_with_scipy():
     assert (trajectory.displacement - torch.from_numpy(found[:8].T)).abs().max() < 1e-5
 
 
+@pytest.mark.parametrize("elongation", [1.0, 1 - 1e-12, 1 + 1e-12, 1.5, 0.5, -2.0])
+def test_slope_of_the_contact_law_where_contacts_open(elongation):
+    """sqrt(1 - e), which is zero and not infinite where a contact opens (Eq. 7)."""
+    chain = tc.Chain(torch.ones(2, dtype=torch.float64), contact="hertz")
+    stretched = torch.full((2,), elongation, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(chain.tension(stretched).sum(), stretched)
+    assert slope.tolist() == pytest.approx([max(1 - elongation, 0.0) ** 0.5] * 2, abs=1e-8)
+
+
 # --- the guard -------------------------------------------------------------------------------------------------
 
 

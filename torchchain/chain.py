@@ -24,7 +24,7 @@ class Chain:
 
     The Hertz contact force is (2/3) kappa (1 - e)^(3/2) for the elongation e < 1 and zero for an open contact,
     e >= 1: its slope at e = 0 is the linear contact's kappa, where Eq. 7 as printed would have (3/2) kappa and
-    times shorter by sqrt(3/2).
+    times shorter by sqrt(3/2). An open contact neither pulls nor damps, by every method.
 
     Attributes:
         masses: (*batch, particle), positive.
@@ -140,10 +140,28 @@ class Chain:
         """Contact force on every particle, K u for linear contacts (Eqs. 7, 13), (*batch, *any, particle)."""
         return self.net(self.tension(self.elongation(displacement)))
 
-    def damping_force(self, velocity: Tensor) -> Tensor:
-        """Damping force -D v on every particle (Eq. 14), (*batch, *any, particle)."""
+    def active_damping(self, displacement: Tensor) -> Tensor:
+        """The damping of every contact in a state, zero where a Hertz contact is open, (*batch, *any, contact)."""
+        elongation = self.elongation(displacement)
+        damping = self.align(self.contact_damping, elongation)
+        return damping if self.contact == "linear" else damping * (elongation < 1)
+
+    def damping_force(self, velocity: Tensor, displacement: Tensor | None = None) -> Tensor:
+        """Damping force -D v on every particle (Eq. 14), (*batch, *any, particle).
+
+        Args:
+            velocity: (*batch, *any, particle).
+            displacement: the same; tells which contacts are open, and only Hertz contacts need it.
+
+        Raises:
+            FieldError: for Hertz contacts without a displacement.
+        """
         rate = self.elongation(velocity)
-        return self.net(self.align(self.contact_damping, rate) * rate)
+        if self.contact == "linear":
+            return self.net(self.align(self.contact_damping, rate) * rate)
+        if displacement is None:
+            raise checks.fail("displacement", "be given for Hertz contacts, which do not damp while open", "None")
+        return self.net(self.active_damping(displacement) * rate)
 
     def contact_energy(self, displacement: Tensor) -> Tensor:
         """Potential energy of every contact relative to the precompressed state, (*batch, *any, contact), never negative."""
@@ -203,6 +221,10 @@ class Chain:
 
 
 def _hertz_variable(elongation: Tensor) -> Tensor:
-    """q = 1 - sqrt(1 - e) = e / (1 + sqrt(1 - e)); 1 for an open contact."""
-    closed = elongation.clamp(max=1)
-    return closed / (1 + (1 - closed).sqrt())
+    """q = 1 - sqrt(1 - e) = e / (1 + sqrt(1 - e)); 1 for an open contact.
+
+    The root's slope is infinite where a contact opens, where the force's is zero: no gradient passes through it there.
+    """
+    is_open = elongation >= 1
+    closed = elongation.masked_fill(is_open, 0)
+    return (closed / (1 + (1 - closed).sqrt())).masked_fill(is_open, 1)

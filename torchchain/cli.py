@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import os
 import re
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -92,8 +96,12 @@ class SceneFlags:
     def overrides(self) -> dict[str, Any]:
         """The flags that were given, as nested plain values."""
         return _given(
-            self, skip=("config", "out", "device", "method", "fit", "model", "window", "constraint", "penalty")
-        )
+            self,
+            skip=(
+                "config", "out", "device", "method", "fit", "model", "window", "constraint", "penalty",
+                "checkpoint_every", "threads",
+            ),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -106,6 +114,10 @@ class Simulate(SceneFlags):
     """cpu, cuda, cuda:1, ..."""
     method: str = "auto"
     """how to evolve the chains; auto for the plan's choice"""
+    checkpoint_every: float = 5.0
+    """seconds between saves of finished realizations in the folder, from which the same command goes on"""
+    threads: int | None = None
+    """threads of this process (default: all cores, shared by the processes that torchrun starts)"""
 
 
 @dataclass(frozen=True)
@@ -128,6 +140,10 @@ class Calibrate(SceneFlags):
     """adam: exact (default) or penalty"""
     penalty: float | None = None
     """adam: weight of the conservation penalty (default 10)"""
+    checkpoint_every: float = 5.0
+    """seconds between saves of finished realizations in the folder, from which the same command goes on"""
+    threads: int | None = None
+    """threads of this process (default: all cores, shared by the processes that torchrun starts)"""
 
     def calibration(self) -> dict[str, Any]:
         """The flags of the fit that were given."""
@@ -167,28 +183,82 @@ class Plan(SceneFlags):
     """The cheapest way to meet a scene, with reasons and runners-up."""
 
 
-COMMANDS: dict[str, Any] = {"simulate": Simulate, "calibrate": Calibrate, "predict": Predict, "plan": Plan}
+@dataclass(frozen=True)
+class Rerun:
+    """Make a run again from its record and compare: exit status 0 if all data are equal to the last bit, 1 if not."""
+
+    folder: Annotated[str, tyro.conf.Positional]
+    """folder left by simulate, calibrate or predict"""
+    out: str | None = None
+    """folder for the new run (default: compared, then discarded)"""
+    device: str | None = None
+    """cpu, cuda, ... (default: the recorded one)"""
+    threads: int | None = None
+    """threads of this process"""
+
+
+COMMANDS: dict[str, Any] = {
+    "simulate": Simulate, "calibrate": Calibrate, "predict": Predict, "plan": Plan, "rerun": Rerun,
+}  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status is 2 for bad input, 1 for a failed computation, 130 for an interrupt."""
+    """Run the command line.
+
+    Returns:
+        The exit status: 2 for bad input, 1 for a failed computation or a rerun that differs, 130 for an interrupt
+        (Ctrl-C), 143 for the signal to end.
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         flags = _parse(arguments)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 2
-    try:
-        from torchchain import commands  # torch and the rest, once the flags are known to be good
-        from torchchain.checks import FieldError, FieldTypeError
-
+    with _one_line_warnings(), _ends() as ends:
         try:
-            return commands.run(flags, arguments)
-        except (FieldError, FieldTypeError) as error:
-            return complain(str(error), 2)
-        except (RuntimeError, MemoryError) as error:  # a solver that gives up, or no memory left
-            return complain(str(error) or type(error).__name__, 1)
-    except KeyboardInterrupt:
-        return complain("interrupted, nothing was written", 130)
+            from torchchain import commands  # torch and the rest, once the flags are known to be good
+            from torchchain.checks import FieldError, FieldTypeError
+
+            try:
+                return commands.run(flags, arguments)
+            except (FieldError, FieldTypeError) as error:
+                return complain(str(error), 2)
+            except (RuntimeError, MemoryError) as error:  # a solver that gives up, or no memory left
+                return complain(str(error) or type(error).__name__, 1)
+        except KeyboardInterrupt as stop:
+            status = complain(str(stop) or "interrupted, nothing was written", 143 if ends else 130)
+            if any(thread.name.startswith("torchchain") for thread in threading.enumerate()):
+                os._exit(status)  # without waiting for the chunks under way, which nobody wants
+            return status
+
+
+@contextlib.contextmanager
+def _ends() -> Iterator[list[int]]:
+    """The signal to end, as a batch system or torchrun sends it, becomes an interrupt; yields those that came."""
+    ends: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield ends
+        return
+
+    def end(number: int, _: Any) -> None:
+        ends.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield ends
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    before = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_, **__: f"torchchain: warning: {' '.join(str(message).split())}\n"
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -223,7 +293,8 @@ def one_line(report: str) -> str:
 
 def complain(message: str, status: int) -> int:
     """Print an error as one line on standard error and hand back the exit status."""
-    print(f"torchchain: error: {' '.join(message.split())}", file=sys.stderr)
+    rank = os.environ.get("RANK", "0")
+    print(f"torchchain: {f'rank {rank}: ' if rank != '0' else ''}error: {' '.join(message.split())}", file=sys.stderr)
     return status
 
 

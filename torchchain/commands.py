@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,9 @@ import tomli_w
 import torch
 import xarray
 
-from torchchain import checks, outputs, planning, plots
-from torchchain.cli import Calibrate, Plan, Predict, SceneFlags, Simulate
+from torchchain import checks, outputs, planning, plots, ranks
+from torchchain.checkpoint import Checkpoint, Interrupted
+from torchchain.cli import Calibrate, Plan, Predict, Rerun, SceneFlags, Simulate
 from torchchain.ensemble import BandTransfer, Stages, band_transfer, simulate
 from torchchain.evolvers import METHODS
 from torchchain.master import SOLVERS, MasterEquation, calibrate
@@ -25,15 +28,47 @@ from torchchain.statistics import statistical_distance, total_variation
 
 def run(flags: Any, arguments: list[str]) -> int:
     """Run the command that the flags belong to; returns the exit status."""
-    if isinstance(flags, Simulate):
-        run_simulate(flags, arguments)
-    elif isinstance(flags, Calibrate):
-        run_calibrate(flags, arguments)
+    if isinstance(flags, (Simulate, Calibrate, Rerun)):
+        with _threads(flags.threads):
+            if isinstance(flags, Simulate):
+                run_simulate(flags, arguments)
+            elif isinstance(flags, Calibrate):
+                run_calibrate(flags, arguments)
+            else:
+                from torchchain.rerun import rerun
+
+                return rerun(flags)
     elif isinstance(flags, Predict):
         run_predict(flags, arguments)
     elif isinstance(flags, Plan):
         print(planning.plan(_scene(flags)[0]))
     return 0
+
+
+@contextmanager
+def _threads(number: int | None) -> Iterator[None]:
+    """Run on as many threads as asked for, or on a fair share of the cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(ranks.fair_threads() if number is None else checks.integer("threads", number, 1, 4096))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _keeping(checkpoint: Checkpoint | None) -> Iterator[None]:
+    """An interrupt after the ensemble is done tells of the realizations that are kept."""
+    try:
+        yield
+    except Interrupted:
+        raise
+    except KeyboardInterrupt:
+        if checkpoint is None or not checkpoint.folder.exists():
+            raise
+        raise Interrupted(
+            f"interrupted: finished realizations are kept in {checkpoint.folder}, the same command goes on from there"
+        ) from None
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,14 +102,38 @@ def _figure(width: float, height: float, rows: int, columns: int) -> Any:
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def run_simulate(flags: Simulate, arguments: list[str]) -> None:
-    """Measure a scene's observables and leave config, data, figure and record in the output folder."""
+def run_simulate(
+    flags: Simulate, arguments: list[str], options: dict[str, Any] | None = None, keep: bool = True
+) -> None:
+    """Measure a scene's observables and leave config, data, figure and record in the output folder.
+
+    Args:
+        flags, arguments: of the command.
+        options: of the method.
+        keep: whether to keep a checkpoint in the folder until it is done.
+    """
     began = time.time()
     scene, _ = _scene(flags)
-    out, device = outputs.check_writable(flags.out), str(checks.device("device", flags.device))
+    out = outputs.check_writable(flags.out)
+    device = str(checks.device("device", ranks.own_device(flags.device)))
     checks.choice("method", flags.method, ("auto", *METHODS))
+    checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
+    with _keeping(checkpoint):
+        _simulate(flags, scene, out, device, arguments, options, checkpoint, began)
+
+
+def _simulate(
+    flags: Simulate, scene: Scene, out: Path, device: str, arguments: list[str], options: dict[str, Any] | None,
+    checkpoint: Checkpoint | None, began: float,
+) -> None:  # fmt: skip
     stages = Stages()
-    data = simulate(scene, flags.method, device=device, progress=True, stages=stages)
+    with ranks.process_group(device) as group:
+        data = simulate(
+            scene, flags.method, device=device, progress=True, stages=stages, options=options, checkpoint=checkpoint,
+            ranks=group,
+        )  # fmt: skip
+    if group.rank:
+        return
     figure = _simulate_figure(scene, data)
     config = scene.to_toml()
     outputs.write(
@@ -84,11 +143,13 @@ def run_simulate(flags: Simulate, arguments: list[str]) -> None:
             "results.nc": outputs.dataset(data),
             "figure.png": outputs.figure(figure),
             "run.json": outputs.run_record(
-                arguments, config, device, began, stages.seconds, seed=scene.seed, method=flags.method,
-                realized={name: data.attrs[name] for name in ("mass_mean", "mass_sd")},
+                arguments, config, device, began, stages.seconds, seed=scene.seed,
+                **_how(flags, data.attrs, group, checkpoint),
             ),
         },
     )  # fmt: skip
+    if checkpoint is not None:
+        checkpoint.clear()
     print(describe(scene))
     print(f"masses: mean {data.attrs['mass_mean']:.6f}, standard deviation {data.attrs['mass_sd']:.6f}")
     for name in scene.observables:
@@ -98,6 +159,19 @@ def run_simulate(flags: Simulate, arguments: list[str]) -> None:
         if last.ndim == 0:
             print(f"{name} at the last time: {float(last):.6g} +- {float(error):.2g}")
     print(f"{time.time() - began:.1f} s, results in {out}")
+
+
+def _how(
+    flags: Simulate | Calibrate, attributes: Mapping[str, Any], group: ranks.Ranks, checkpoint: Checkpoint | None
+) -> dict[str, Any]:
+    """What the record says of an ensemble: the method asked for and the one used, processes, what was taken over."""
+    return {
+        "method": flags.method,
+        "resolved": {"method": attributes["method"], "options": json.loads(attributes["method_options"])},
+        "processes": group.size,
+        "resumed_realizations": checkpoint.resumed if checkpoint is not None else 0,
+        "realized": {name: attributes[name] for name in ("mass_mean", "mass_sd")},
+    }
 
 
 def _simulate_figure(scene: Scene, data: xarray.Dataset) -> Any:
@@ -127,8 +201,14 @@ def _simulate_figure(scene: Scene, data: xarray.Dataset) -> Any:
     return figure
 
 
-def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
-    """Ensemble, master equation, prediction and their distance; leaves data, model, figure and record."""
+def run_calibrate(
+    flags: Calibrate, arguments: list[str], options: dict[str, Any] | None = None, keep: bool = True
+) -> None:
+    """Ensemble, master equation, prediction and their distance; leaves data, model, figure and record.
+
+    Args:
+        flags, arguments, options, keep: as for :func:`run_simulate`.
+    """
     began = time.time()
     scene, extra = _scene(flags, ("calibration",))
     table = extra.get("calibration", {})
@@ -139,11 +219,27 @@ def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])
-    out, device = outputs.check_writable(flags.out), str(checks.device("device", flags.device))
+    out = outputs.check_writable(flags.out)
+    device = str(checks.device("device", ranks.own_device(flags.device)))
     checks.choice("method", flags.method, ("auto", *METHODS))
     recipe(scene, **settings)  # before the ensemble is computed
+    checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
+    with _keeping(checkpoint):
+        _calibrate(flags, scene, settings, out, device, arguments, options, checkpoint, began)
+
+
+def _calibrate(
+    flags: Calibrate, scene: Scene, settings: dict[str, Any], out: Path, device: str, arguments: list[str],
+    options: dict[str, Any] | None, checkpoint: Checkpoint | None, began: float,
+) -> None:  # fmt: skip
     stages = Stages()
-    transfer = band_transfer(scene, flags.method, device=device, progress=True, stages=stages)
+    with ranks.process_group(device) as group:
+        transfer = band_transfer(
+            scene, flags.method, device=device, progress=True, stages=stages, options=options, checkpoint=checkpoint,
+            ranks=group,
+        )  # fmt: skip
+    if group.rank:
+        return
     with stages("calibration"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         master = calibrate(transfer, progress=True, **settings)
@@ -168,11 +264,13 @@ def run_calibrate(flags: Calibrate, arguments: list[str]) -> None:
                 "model.safetensors": master.save,
                 "figure.png": outputs.figure(figure),
                 "run.json": outputs.run_record(
-                    arguments, config, device, began, stages.seconds, seed=scene.seed, method=flags.method,
-                    realized=transfer.attributes, summary=dict(rows),
+                    arguments, config, device, began, stages.seconds, seed=scene.seed,
+                    **_how(flags, transfer.attributes, group, checkpoint), summary=dict(rows),
                 ),
             },
         )  # fmt: skip
+    if checkpoint is not None:
+        checkpoint.clear()
     print(describe(transfer.scene))
     for warning in caught:
         print(f"warning: {warning.message}")
@@ -267,6 +365,7 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
     stages = Stages()
     with stages("loading"):
         master = MasterEquation.load(flags.model).to(device)
+        digest = outputs.sha256(flags.model)
     n = master.n_bands
     times = given.get("times", {})
     if isinstance(times, Mapping):
@@ -323,10 +422,11 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
             "results.nc": outputs.dataset(data),
             "figure.png": outputs.figure(figure),
             "run.json": outputs.run_record(
-                arguments, text, device, began, stages.seconds, seed=flags.seed, method=flags.method
+                arguments, text, device, began, stages.seconds, seed=flags.seed, method=flags.method,
+                model={"path": str(Path(flags.model).resolve()), "sha256": digest},
             ),
         },
-    )
+    )  # fmt: skip
     print(f"{len(labels)} starts, {len(wanted)} times to {float(wanted[-1]):g}, solved by {flags.method}")
     print(f"largest change of total energy: {float((energy.sum(-1) - starts.sum(-1)[:, None]).abs().max()):.3g}")
     print(f"lowest energy in a band: {float(energy.min()):.3g}")

@@ -1,12 +1,20 @@
-"""Stream the realizations of a scene through evolution and observables into means, error bars and long-time averages."""
+"""Stream the realizations of a scene through evolution and observables into means, error bars and long-time averages.
+
+Results are the same to the last bit whatever the chunks, threads and processes, and whether or not a run was killed
+and went on. Matrix products round differently for another number of rows, so the realizations and times that go
+through a product together are chosen from the scene alone; the stencil's kernels treat every row by itself; and the
+order in which moments merge depends on realization numbers alone.
+"""
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,14 +23,17 @@ import xarray
 from torch import Tensor
 from tqdm import tqdm
 
-from torchchain import checks, planning
+from torchchain import checks, footprint, fused, planning
 from torchchain.bands import band_of
 from torchchain.chain import Chain
+from torchchain.checkpoint import Checkpoint, Kept, uninterrupted
 from torchchain.energy import energy_center, energy_width, particle_energy, total_energy
-from torchchain.evolvers import METHODS, Trajectory, fused, start
+from torchchain.evolvers import METHODS, Trajectory, start
 from torchchain.evolvers.linearity import elongation_estimate, warn_if_nonlinear
 from torchchain.excitation import Impulse, StandingWave, State
 from torchchain.modal_bands import modal_band_energy
+from torchchain.ranks import ALONE, Ranks
+from torchchain.reach import Reach, ReachExceeded, reach
 from torchchain.scene import Scene
 from torchchain.spectrum import NormalModes, normal_modes
 from torchchain.statistics import EnsembleMoments, Moments, merged
@@ -30,9 +41,13 @@ from torchchain.threads import map_in_order, single_thread
 from torchchain.wavenumber import band_energy, long_time_band_energy, wavenumber_energy
 
 Measured = TypeVar("Measured")
-MEMORY_BUDGET = 2**29
-CACHE_FRIENDLY = 2**25  # states of a chunk beyond this size cost more per byte: page faults
+# Bytes of the states that go through matrix products together. On the CPU more cost more per byte: page faults.
+TOGETHER = {"cpu": 2**25, "cuda": 2**30}
+DECOMPOSED = {"cpu": 2**22, "cuda": 2**30}  # and of the matrices of a long-time average
+GROUPS = 16  # at least so many, for the threads to share
+CHUNK_WORK = 2**26  # particles times rows times times of a chunk of the stencil: about a second
 BLOCKS = 20
+PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 
 
 @dataclass(frozen=True)
@@ -54,6 +69,16 @@ def _source_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor
     return _energy(scene, chain, trajectory)[..., site - 1]
 
 
+def _band_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+    """Share of the energy, of that at the start where damping takes some of it."""
+    share = band_energy(chain, trajectory, scene.n_bands, scene.damping == 0, scene.energy_definition)
+    if scene.damping == 0:
+        return share
+    state = scene.state(chain)
+    begin = Trajectory(trajectory.times[:1], state.displacement[..., None, :], state.velocity[..., None, :])
+    return share / total_energy(chain, begin)[..., None]
+
+
 ENERGY_UNIT = "contact stiffness * initial overlap^2"
 IN_TIME: dict[str, Observable] = {
     "displacement": Observable(("time", "particle"), "initial overlap", "displacement", lambda s, c, t: t.displacement),
@@ -73,8 +98,8 @@ IN_TIME: dict[str, Observable] = {
     "band_energy": Observable(
         ("time", "band"),
         "1",
-        "share of the energy in a band",
-        lambda s, c, t: band_energy(c, t, s.n_bands, True, s.energy_definition),
+        "share of the energy in a band (of the start's energy, where damping takes some)",
+        _band_energy,
     ),
 }
 
@@ -102,7 +127,10 @@ class Stages:
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Realizations first, first + 1, ... of a scene, evolved together."""
+    """Realizations first, first + 1, ... of a scene, evolved together; only the part that moves, if that is known.
+
+    ``group`` of them, and ``window`` times, go through matrix products at once.
+    """
 
     scene: Scene
     first: int
@@ -112,7 +140,10 @@ class Chunk:
     options: dict[str, Any]
     times: Tensor
     window: int
+    group: int
     stages: Stages
+    reach: Reach | None = None
+    watch: Callable[[Chain, Trajectory], None] | None = None
 
     @cached_property
     def modes(self) -> NormalModes:
@@ -128,12 +159,17 @@ class Chunk:
         for begin in range(0, len(self.times), self.window):
             with self.stages("evolution"):
                 trajectory = advance(self.times[begin : begin + self.window])
+            if self.watch is not None:
+                self.watch(self.chain, trajectory)
             yield trajectory
 
     def observe(self, names: Sequence[str]) -> dict[str, Tensor]:
         """The named observables at all times, (realization, [tone,] *axes)."""
         if not names:
             return {}
+        if self.reach is not None and not _is_fused(self.method, names):
+            with suppress(ReachExceeded):  # the whole chain, then
+                return self._observe_part(self.reach, names)
         if _is_fused(self.method, names):
             given = (self.chain, self.state, self.times)
             definition = self.scene.energy_definition
@@ -158,13 +194,100 @@ class Chunk:
                     parts[name].append(IN_TIME[name].of(self.scene, self.chain, trajectory))
         return {name: torch.cat(values, dim=-len(IN_TIME[name].axes)) for name, values in parts.items()}
 
+    def _observe_part(self, part: Reach, names: Sequence[str]) -> dict[str, Tensor]:
+        """:meth:`observe` from the part of the chains that moves."""
+        inside = replace(
+            self,
+            scene=part.scene(self.scene),
+            chain=part.chain(self.chain),
+            state=part.state(self.state),
+            reach=None,
+            watch=part.check,
+        )
+        return {name: part.embed(name, values) for name, values in inside.observe(names).items()}
+
     def long_time(self) -> Tensor:
         """Infinite-time average of the normalized band energies, (realization, [tone,] band)."""
-        modes = self.modes
-        with self.stages("long-time average"):
-            return long_time_band_energy(
-                self.chain, self.state, self.scene.n_bands, modes=modes, definition=self.scene.energy_definition
-            )
+        if len(self.chain.masses) > self.group:
+            firsts = range(0, len(self.chain.masses), self.group)
+            return torch.cat([self._some(first, first + self.group).long_time() for first in firsts])
+        with single_thread():
+            modes = self.modes
+            with self.stages("long-time average"):
+                return long_time_band_energy(
+                    self.chain, self.state, self.scene.n_bands, modes=modes, definition=self.scene.energy_definition
+                )
+
+    def _some(self, low: int, high: int) -> Chunk:
+        """Some of the realizations."""
+        chain, state, stiffness = self.chain, self.state, torch.as_tensor(self.chain.stiffness)
+        return replace(
+            self,
+            first=self.first + low,
+            chain=replace(
+                chain, masses=chain.masses[low:high], stiffness=stiffness[low:high] if stiffness.ndim > 1 else stiffness
+            ),
+            state=State(state.displacement[low:high], state.velocity[low:high]),
+        )
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the realizations of a scene are cut.
+
+    Attributes:
+        window, group: times and realizations whose states go through matrix products together; from the scene, the
+            method and the kind of device alone, as they decide how products round.
+        size: realizations of a chunk, a multiple of ``group``.
+        workers: chunks under way at once.
+    """
+
+    window: int
+    group: int
+    size: int
+    workers: int
+
+
+def layout(
+    scene: Scene,
+    method: str,
+    names: Sequence[str],
+    device: torch.device,
+    realizations: int | None = None,
+    memory_budget: int | None = None,
+) -> Layout:
+    """The layout of a scene's realizations, or of those of them that are still wanted.
+
+    Raises:
+        FieldError: if one realization at a time takes more memory than there is.
+    """
+    fused = device.type == "cpu" and _is_fused(method, names)
+    axes = {name: IN_TIME[name].axes if name in IN_TIME else ("band",) for name in names}
+    part = None if fused else reach(scene)
+    whole, inside = (
+        footprint.footprint(each, method, fused, tuple(names), axes)
+        for each in (scene, part.scene(scene) if part else scene)
+    )
+    one = replace(inside, results=whole.results)
+    every = 1 if scene.is_ordered else scene.realizations
+    wanted = every if realizations is None else realizations
+    together, few = TOGETHER[device.type], max(1, every // GROUPS)
+    window = len(scene.times) if fused else min(len(scene.times), max(1, together // one.state))
+    held = one.state if fused else one.matrices + one.state * window
+    footprint.check(scene, one, 1 if fused else window, BLOCKS + every.bit_length(), device)
+    budget = footprint.memory(device) // 4 if memory_budget is None else memory_budget
+    threads = torch.get_num_threads() if device.type == "cpu" else 1
+    if fused:
+        group = max(1, min(few, DECOMPOSED[device.type] // (64 * scene.n_particles**2)))
+        points = max(1, len(scene.tones)) * scene.n_particles * max(len(scene.times), int(scene.times[-1]))
+        workers = max(1, min(threads, wanted))
+        half = -(-wanted // (2 * workers))  # two chunks a worker, for the progress bar
+        size = max(1, min(half, CHUNK_WORK // points, budget // workers // (held + 2 * one.results)))
+        return Layout(window, group, -(-size // group) * group, workers)
+    few = max(1, min(few, together // scene.n_particles))  # masses of the whole chains
+    group = max(1, min(few, (one.matrices + together) // (held + 2 * one.results)))
+    chunk = group * (held + 2 * one.results)
+    return Layout(window, group, group, max(1, min(threads, -(-wanted // group), budget // chunk)))
 
 
 def stream(
@@ -173,10 +296,12 @@ def stream(
     method: str = "auto",
     *,
     device: str | torch.device = "cpu",
-    memory_budget: int = MEMORY_BUDGET,
+    memory_budget: int | None = None,
     progress: bool = False,
     stages: Stages | None = None,
     options: dict[str, Any] | None = None,
+    names: Sequence[str] | None = None,
+    numbers: Sequence[range] | None = None,
 ) -> Iterator[tuple[int, Measured]]:
     """Measure the realizations of a scene in chunks that keep to a memory budget, in order.
 
@@ -188,55 +313,77 @@ def stream(
         measure: from a chunk to whatever is wanted of it; called on several threads.
         method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
         device: where the chains are computed.
-        memory_budget: bytes for all chunks under way; times are cut into windows where one chain exceeds it.
+        memory_budget: bytes for all chunks under way, of which fewer run side by side where they exceed it, but at
+            least one; by default a quarter of the memory.
         progress: show a bar if the output is a terminal.
         stages: collects seconds per stage.
-        options: the method's own.
+        options: the method's own, and ``dtype``, "float64" or "float32".
+        names: observables that ``measure`` takes; by default the scene's.
+        numbers: realizations to measure, as ranges in order, their starts multiples of the layout's ``group``; by
+            default all.
 
     Yields:
         The first realization of the chunk, counted from 0, and what was measured.
+
+    Raises:
+        FieldError: also if one realization at a time takes more memory than there is.
     """
-    options = dict(options or {})
     checks.choice("method", method, ("auto", *METHODS))
     device = checks.device("device", device)
-    if method == "auto":
-        plan = planning.plan(scene)
-        method, options = plan.method, {**plan.options, **options}
+    if memory_budget is not None:
+        checks.integer("memory_budget", memory_budget, 1)
+    names = scene.observables if names is None else names
+    layout(scene, method, names, device)  # before the plan draws a chain
+    scene = planning.resolved(scene)
+    method, options = chosen(scene, method, options, names)
+    dtype = PRECISIONS[checks.choice("dtype", options.pop("dtype", "float64"), PRECISIONS)]
     stages = stages or Stages()
     check_amplitude(scene)
-    budget = checks.integer("memory_budget", memory_budget, 1)
-    realizations = 1 if scene.is_ordered else scene.realizations
-    workers = min(torch.get_num_threads(), realizations) if device.type == "cpu" else 1
-    window, size = _chunking(scene, method, realizations, workers, budget // workers)
-    times = scene.times.to(device)
+    if numbers is None:
+        numbers = [range(1 if scene.is_ordered else scene.realizations)]
+    wanted = sum(map(len, numbers))
+    plan = layout(scene, method, names, device, wanted, memory_budget)
+    times, part = scene.times.to(device), reach(scene)
 
     def work(numbers: range) -> tuple[range, Measured, dict[str, float]]:
-        spent = Stages(1 / workers)
-        with spent("masses"):
-            chain = scene.chain(numbers, device)
+        spent = Stages(1 / plan.workers)
+        with single_thread(), spent("masses"):
+            chain = scene.chain(numbers, device, dtype)
             state = scene.state(chain)
-        measured = measure(Chunk(scene, numbers[0], chain, state, method, options, times, window, spent))
-        return numbers, measured, spent.seconds
+        chunk = Chunk(scene, numbers[0], chain, state, method, options, times, plan.window, plan.group, spent, part)
+        if device.type == "cpu" and _is_fused(method, names):  # the kernels' bits do not depend on threads
+            return numbers, measure(chunk), spent.seconds
+        with single_thread():
+            return numbers, measure(chunk), spent.seconds
 
-    chunks = [range(first, min(first + size, realizations)) for first in range(0, realizations, size)]
-    with tqdm(total=realizations, unit="chain", disable=None if progress else True, leave=False) as bar:
-        for numbers, measured, seconds in map_in_order(work, chunks, workers):
+    begun = (1 if scene.is_ordered else scene.realizations) - wanted
+    hidden = None if progress else True
+    with tqdm(total=begun + wanted, initial=begun, unit="chain", disable=hidden, leave=False) as bar:
+        for done, measured, seconds in map_in_order(work, _chunks(numbers, plan.size), plan.workers):
             stages.add(seconds)
-            yield numbers[0], measured
-            bar.update(len(numbers))
+            yield done[0], measured
+            bar.update(len(done))
 
 
-def _chunking(scene: Scene, method: str, realizations: int, workers: int, budget: int) -> tuple[int, int]:
-    """Times per window and realizations per chunk that keep one worker's chunk within a budget of bytes."""
-    rows = max(1, len(scene.tones))
-    share = -(-realizations // workers)
-    if _is_fused(method, scene.observables):  # no states are stored: two chunks a worker, for the progress bar
-        return len(scene.times), max(1, min(-(-share // 2), budget // (8 * rows * 12 * scene.n_particles)))
-    state_bytes = 8 * rows * scene.n_particles * 10  # states, phases, transforms, products
-    mode_bytes = 8 * scene.n_particles**2 * 8 if method == "modes" else 0
-    window = max(1, min(len(scene.times), min(budget - mode_bytes, CACHE_FRIENDLY) // state_bytes))
-    size = max(1, min(budget, mode_bytes + CACHE_FRIENDLY) // (mode_bytes + state_bytes * window))
-    return window, min(size, share)
+def _chunks(numbers: Sequence[range], size: int) -> Iterator[range]:
+    """The realizations in chunks that end at multiples of a size."""
+    for part in numbers:
+        first = part.start
+        while first < part.stop:
+            last = min(part.stop, (first // size + 1) * size)
+            yield range(first, last)
+            first = last
+
+
+def chosen(
+    scene: Scene, method: str, options: dict[str, Any] | None = None, names: Sequence[str] | None = None
+) -> tuple[str, dict[str, Any]]:
+    """The method and its options, the plan's for the observables of these names where they are left to it."""
+    options = dict(options or {})
+    if method != "auto":
+        return method, options
+    plan = planning.plan(scene if names is None else replace(scene, observables=tuple(names)))
+    return plan.method, {**plan.run_options, **options}
 
 
 def _is_fused(method: str, names: Sequence[str]) -> bool:
@@ -261,38 +408,119 @@ def check_amplitude(scene: Scene) -> None:
     warn_if_nonlinear(chain, state, stacklevel=4)
 
 
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """The moments of an ensemble, and how its chains were evolved."""
+
+    moments: EnsembleMoments
+    method: str
+    options: dict[str, Any]
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """``mass_mean`` and ``mass_sd`` over all particles of all realizations, ``method`` and ``method_options``."""
+        notes = {"method": self.method, "method_options": json.dumps(self.options, default=checks.shown)}
+        return realized_masses(self.moments) | notes
+
+
 def ensemble_moments(
     scene: Scene,
     measure: Callable[[Chunk], dict[str, Tensor]],
     method: str = "auto",
     n_blocks: int = 1,
     *,
+    names: Sequence[str],
+    options: dict[str, Any] | None = None,
+    device: str | torch.device = "cpu",
     stages: Stages | None = None,
+    progress: bool = False,
+    checkpoint: Checkpoint | str | Path | None = None,
+    ranks: Ranks = ALONE,
     **settings: Any,
-) -> EnsembleMoments:
+) -> Ensemble:
     """Moments over an ensemble of named measurements (realization, ...), and of the masses under "mass_moments".
 
     Args:
-        scene, measure, method, stages, settings: see :func:`stream`.
+        scene, method, options, device, stages, progress: see :func:`stream`.
+        measure: from a chunk to the measurements called ``names``.
         n_blocks: of consecutive realizations whose moments are kept apart.
+        checkpoint: keeps finished realizations, and those of an earlier run are not computed again.
+        ranks: processes that share the realizations; each gets the result.
+        settings: see :func:`stream`.
     """
     realizations = 1 if scene.is_ordered else scene.realizations
+    device, stages = checks.device("device", device), stages or Stages()
+    checks.choice("method", method, ("auto", *METHODS))
+    layout(scene, method, names, device)
+    if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
+        checkpoint = Checkpoint(checkpoint)
+    identity = {
+        "measured": list(names), "blocks": n_blocks, **scene.to_dict(),
+        "method": method, "options": options or {}, "device": device.type,
+    }  # fmt: skip
+    kept = Kept(EnsembleMoments(realizations, n_blocks))
+    begin: Any = None
+    if ranks.rank == 0:
+        try:
+            if checkpoint is not None:
+                kept = checkpoint.read(identity, realizations, n_blocks)
+            plan = kept.plan
+            if plan is None:
+                plan = dict(zip(("method", "options"), chosen(scene, method, names=names), strict=True))
+            begin = plan, kept.session, _missing(kept.moments.held(), realizations)
+        except (checks.FieldError, checks.FieldTypeError) as error:
+            begin = error
+    begin = ranks.agree(begin)
+    if isinstance(begin, Exception):
+        raise begin
+    plan, session, missing = begin
+    method, options = plan["method"], {**plan["options"], **(options or {})}
     total = EnsembleMoments(realizations, n_blocks)
-    stages = stages or Stages()
+    writer = checkpoint.writer(session, ranks.rank, identity, plan) if checkpoint is not None else None
 
     def reduced(chunk: Chunk) -> EnsembleMoments:
-        measured = {name: values.cpu() for name, values in measure(chunk).items()}
-        masses = chunk.chain.masses.cpu()
-        measured["mass_moments"] = torch.stack([masses.mean(-1), masses.square().mean(-1)], dim=-1)
+        measured = {name: values.cpu().double() for name, values in measure(chunk).items()}
+        masses = chunk.chain.masses.cpu().numpy()  # NumPy sums each row by itself
+        moments = np.stack([masses.mean(-1), np.square(masses).mean(-1)], axis=-1)
+        measured["mass_moments"] = torch.from_numpy(moments)
         part = EnsembleMoments(realizations, n_blocks)
         with chunk.stages("statistics"):
             part.add(chunk.first, measured)
         return part
 
-    for _, part in stream(scene, reduced, method, stages=stages, **settings):
-        with stages("statistics"):
-            total.absorb(part)
-    return total
+    own = ranks.share(missing, layout(scene, method, names, device).group)
+    parts = stream(
+        scene, reduced, method, options=options, device=device, stages=stages, names=names, numbers=own,
+        progress=progress and ranks.rank == 0, **settings,
+    )  # fmt: skip
+    try:
+        for _, part in parts:
+            with uninterrupted():
+                with stages("statistics"):
+                    total.absorb(part)
+                if writer is not None and writer.due:
+                    with stages("checkpoint"):
+                        writer.save(total)
+        if writer is not None and ranks.size > 1:
+            writer.close(total)  # the others may take long
+    except KeyboardInterrupt:
+        if writer is None:
+            raise
+        raise writer.interrupted(total, realizations) from None
+    except Exception:
+        if writer is not None:
+            writer.close(total)
+        raise
+    total = ranks.total(total)
+    if ranks.rank == 0:
+        total.absorb(kept.moments)
+    return Ensemble(ranks.everywhere(total), method, options)
+
+
+def _missing(held: Sequence[range], realizations: int) -> list[range]:
+    """The realizations that are in none of the ranges, which are in order."""
+    edges = [0, *(edge for part in held for edge in (part.start, part.stop)), realizations]
+    return [range(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b]
 
 
 def realized_masses(moments: EnsembleMoments) -> dict[str, float]:
@@ -306,10 +534,12 @@ def simulate(
     method: str = "auto",
     *,
     device: str | torch.device = "cpu",
-    memory_budget: int = MEMORY_BUDGET,
+    memory_budget: int | None = None,
     progress: bool = False,
     stages: Stages | None = None,
     options: dict[str, Any] | None = None,
+    checkpoint: Checkpoint | str | Path | None = None,
+    ranks: Ranks = ALONE,
 ) -> xarray.Dataset:
     """Ensemble means of the scene's observables and their standard errors.
 
@@ -317,13 +547,15 @@ def simulate(
         scene: what is wanted; its ``observables`` name the variables.
         method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
         device, memory_budget, progress, stages, options: see :func:`stream`.
+        checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
+        ranks: processes that share the realizations, from :func:`torchchain.ranks.process_group`; each gets the result.
 
     Returns:
         Dataset with a variable and its ``_stderr`` for every observable, axes ([tone,] time, particle | wavenumber |
         band), coordinates counted from 1, units in the attributes; realized mass moments in the attributes.
         A single realization of a disordered chain has the standard error infinity.
     """
-    stages = stages or Stages()
+    scene, stages = planning.resolved(scene), stages or Stages()
     in_time = [name for name in scene.observables if name in IN_TIME]
 
     def measure(chunk: Chunk) -> dict[str, Tensor]:
@@ -332,19 +564,13 @@ def simulate(
             measured["long_time_band_energy"] = chunk.long_time()
         return measured
 
-    moments = ensemble_moments(
-        scene,
-        measure,
-        method,
-        device=device,
-        memory_budget=memory_budget,
-        progress=progress,
-        stages=stages,
-        options=options,
-    )
+    ensemble = ensemble_moments(
+        scene, measure, method, names=scene.observables, device=device, memory_budget=memory_budget, progress=progress,
+        stages=stages, options=options, checkpoint=checkpoint, ranks=ranks,
+    )  # fmt: skip
     with single_thread():
-        found = {name: merged(moments.blocks(name)) for name in scene.observables}
-        return _dataset(scene, found, realized_masses(moments))
+        found = {name: merged(ensemble.moments.blocks(name)) for name in scene.observables}
+        return _dataset(scene, found, ensemble.attributes)
 
 
 def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, Any]) -> xarray.Dataset:
@@ -421,7 +647,8 @@ class BandTransfer:
         block_mean: means over consecutive blocks of realizations, [block, source, time, receiver].
         block_long_time: [block, source, receiver], or None.
         block_counts: realizations in each block.
-        attributes: realized mean and standard deviation of the masses, ``mass_mean`` and ``mass_sd``.
+        attributes: realized mean and standard deviation of the masses, ``mass_mean`` and ``mass_sd``; the ``method`` that
+            evolved the chains and, as JSON, its ``method_options``.
     """
 
     scene: Scene
@@ -484,7 +711,8 @@ class BandTransfer:
             tensor("block_band_energy"),
             tensor("block_long_time") if held else None,
             tuple(int(n) for n in data["block_count"].values),
-            {name: float(data.attrs[name]) for name in ("mass_mean", "mass_sd")},
+            {name: float(data.attrs[name]) for name in ("mass_mean", "mass_sd")}
+            | {name: str(data.attrs[name]) for name in ("method", "method_options") if name in data.attrs},
         )
 
 
@@ -494,18 +722,22 @@ def band_transfer(
     long_time: bool = True,
     *,
     device: str | torch.device = "cpu",
-    memory_budget: int = MEMORY_BUDGET,
+    memory_budget: int | None = None,
     progress: bool = False,
     stages: Stages | None = None,
     options: dict[str, Any] | None = None,
+    checkpoint: Checkpoint | str | Path | None = None,
+    ranks: Ranks = ALONE,
 ) -> BandTransfer:
     """The transfer of energy from every band to every band: one standing wave per band, averaged over the ensemble.
 
     Args:
         scene: standing waves with one tone in each of its bands, or none given (the bands' center tones).
         method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
-        long_time: also take the exact infinite-time average from the modes.
+        long_time: also take the exact infinite-time average from the modes; damped chains have none.
         device, memory_budget, progress, stages, options: see :func:`stream`.
+        checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
+        ranks: processes that share the realizations, from :func:`torchchain.ranks.process_group`; each gets the result.
 
     Returns:
         BandTransfer with mean and stderr [source, time, receiver].
@@ -513,8 +745,8 @@ def band_transfer(
     Raises:
         FieldError: if the excitation is no standing wave, or a band has not exactly one tone.
     """
-    scene = _transfer_scene(scene)
-    stages = stages or Stages()
+    scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
+    long_time = long_time and scene.damping == 0
     realizations = 1 if scene.is_ordered else scene.realizations
     n_blocks = min(BLOCKS, realizations)
 
@@ -522,23 +754,18 @@ def band_transfer(
         measured = chunk.observe(["band_energy"])
         return measured | ({"long_time": chunk.long_time()} if long_time else {})
 
-    moments = ensemble_moments(
-        scene,
-        measure,
-        method,
-        n_blocks,
-        device=device,
-        memory_budget=memory_budget,
-        progress=progress,
-        stages=stages,
-        options=options,
-    )
+    ensemble = ensemble_moments(
+        scene, measure, method, n_blocks, names=("band_energy", *["long_time_band_energy"] * long_time), device=device,
+        memory_budget=memory_budget, progress=progress, stages=stages, options=options, checkpoint=checkpoint,
+        ranks=ranks,
+    )  # fmt: skip
     with single_thread(), stages("statistics"):
-        return _transfer(scene, moments, long_time)
+        return _transfer(scene, ensemble, long_time)
 
 
-def _transfer(scene: Scene, moments: EnsembleMoments, long_time: bool) -> BandTransfer:
+def _transfer(scene: Scene, ensemble: Ensemble, long_time: bool) -> BandTransfer:
     """The BandTransfer of the blocks' moments in time and at infinite time."""
+    moments = ensemble.moments
     blocks = moments.blocks("band_energy")
     total = merged(blocks)
     ends = moments.blocks("long_time") if long_time else []
@@ -553,7 +780,7 @@ def _transfer(scene: Scene, moments: EnsembleMoments, long_time: bool) -> BandTr
         torch.stack([block.mean for block in blocks]),
         torch.stack([block.mean for block in ends]) if ends else None,
         tuple(block.count for block in blocks),
-        realized_masses(moments),
+        ensemble.attributes,
     )
 
 

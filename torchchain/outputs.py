@@ -105,10 +105,14 @@ def figure(drawn: Any) -> Writer:
 def run_record(
     arguments: Sequence[str], config: str, device: str, began: float, stages: dict[str, float], **more: Any
 ) -> Writer:
-    """A writer of run.json: command, config hash, versions, device, threads, durations and git revision."""
-    record = {
+    """A writer of run.json, to be written last: what is needed to make the run again, and to know it again.
+
+    Command and folder it was given in, hashes of config and files, versions, device, threads, durations, git revision.
+    """
+    record: dict[str, Any] = {
         "command": shlex.join(["torchchain", *arguments]),
         "arguments": list(arguments),
+        "working_directory": os.getcwd(),
         "config_sha256": hashlib.sha256(config.encode()).hexdigest(),
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
         "device": device if device == "cpu" else f"{device}: {torch.cuda.get_device_name(device)}",
@@ -120,7 +124,18 @@ def run_record(
         "git_revision": _git_revision(),
         **more,
     }
-    return text(json.dumps(_strict(record), indent=2, allow_nan=False) + "\n")
+
+    def writer(path: Path) -> None:
+        record["files"] = {beside.name: sha256(beside) for beside in sorted(path.parent.iterdir())}
+        path.write_text(json.dumps(_strict(record), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+    return writer
+
+
+def sha256(path: str | Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _strict(value: Any) -> Any:

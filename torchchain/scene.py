@@ -56,7 +56,7 @@ class Scene:
         tolerance: accuracy wanted for the observables, relative to their scale; None for the ensemble's own error.
         observables: names from ``OBSERVABLES``.
         stiffness_disorder: of the contact stiffnesses; None for equal contacts.
-        contact: "linear" or "hertz".
+        contact: "linear", "hertz", or "auto" for linear where the force of a linear contact is within the tolerance.
         damping: contact damping coefficient.
         energy_definition: "site" (Eqs. 36, 42) or "bond" (Eq. A3).
         si: the beads in SI units, for results in seconds and meters; None to stay dimensionless.
@@ -104,7 +104,7 @@ class Scene:
         checks.first_bad("times", f"be at most {LATEST_TIME:g}, where rounding blurs phases", self.times, late)
         if self.tolerance is not None:
             put("tolerance", checks.number("tolerance", self.tolerance, above=0, below=1))
-        checks.choice("contact", self.contact, CONTACTS)
+        checks.choice("contact", self.contact, (*CONTACTS, "auto"))
         put("damping", checks.number("damping", self.damping, at_least=0))
         checks.choice("energy_definition", self.energy_definition, ("site", "bond"))
         if isinstance(self.observables, str) or not isinstance(self.observables, Sequence) or not self.observables:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -9,6 +10,10 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import Chain
+
+
+class SpectrumWarning(UserWarning):
+    """Frequencies so far apart that the slow modes have lost half of their digits."""
 
 
 class DecompositionError(RuntimeError):
@@ -49,12 +54,43 @@ def normal_modes(chain: Chain) -> NormalModes:
     weight = chain.masses.rsqrt()
     symmetric = -chain.stiffness_matrix() * weight[..., :, None] * weight[..., None, :]
     try:
-        _, vectors = torch.linalg.eigh(symmetric)
+        squared, vectors = torch.linalg.eigh(symmetric)
     except torch.linalg.LinAlgError as error:  # torch's own message names the member of the batch
         raise DecompositionError(
             f"masses and stiffnesses must leave the eigen-solver finite numbers, got: {error}"
         ) from None
+    if symmetric.requires_grad:
+        symmetric.register_hook(lambda gradient: _check_gradient(gradient, squared.detach()))
     return checked_modes(chain, vectors)
+
+
+def _check_gradient(gradient: Tensor, squared: Tensor) -> None:
+    """An error where two modes of one frequency leave the eigenvectors without a derivative."""
+    bad = ~gradient.isfinite().all(-1).all(-1)
+    if bool(bad.any()):
+        where = tuple(int(i) for i in bad.nonzero()[0])
+        gap = squared[where].diff()
+        lower = int(gap.argmin())
+        raise DecompositionError(
+            f"modes must differ in frequency for a gradient of masses or stiffnesses, got squared frequencies "
+            f"{squared[where][lower].item():.6g} of modes {lower + 1} and {lower + 2} that differ by "
+            f"{gap[lower].item():.1e}{checks.position(where)} (method 'chebyshev' has the gradient)"
+        )
+
+
+def _warn_if_wide(squared: Tensor) -> None:
+    """A :class:`SpectrumWarning` where rounding of the largest squared frequency is felt by the common ones, (*batch, mode)."""
+    eps = torch.finfo(squared.dtype).eps
+    ratio = squared.amax(-1) / squared.median(-1).values
+    bad = eps * ratio > eps**0.5
+    if bool(bad.any()):
+        where = tuple(int(i) for i in bad.nonzero()[0])
+        warnings.warn(
+            f"the highest squared frequency is {ratio[where].item():.1e} times the median{checks.position(where)}: rounding "
+            f"leaves the other modes accurate to {eps * ratio[where].item():.1e} (method 'chebyshev' keeps more digits)",
+            SpectrumWarning,
+            stacklevel=4,
+        )
 
 
 def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
@@ -93,6 +129,7 @@ def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
             f"{residual[where].item():.1e} and orthogonality defect {orthogonality[where].item():.1e}"
             + checks.position(where)
         )
+    _warn_if_wide(squared.detach())
     if chain.boundary == "periodic":  # no square root of the zero mode: it has no derivative there
         frequencies = torch.cat([torch.zeros_like(squared[..., :1]), squared[..., 1:].sqrt()], dim=-1)
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -53,10 +53,15 @@ class MomentTree:
     Node (level, i) holds the moments of realizations i 2^level to (i + 1) 2^level - 1 and is always the merger
     of its two children. Which numbers meet which is fixed by the realization numbers alone, so that the result is
     bitwise the same for every chunk size and every division among processes. At most about log2(R) nodes wait.
+
+    Args:
+        size: realizations in all, 0 to size - 1; with the last of them the nodes become one. None if not known.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, size: int | None = None) -> None:
+        self.size = size
         self.waiting: dict[tuple[int, int], tuple[Tensor, Tensor | None]] = {}  # a leaf has no squares
+        self.whole: Moments | None = None
         self.count = 0
 
     def add(self, first: int, values: Tensor) -> None:
@@ -84,10 +89,12 @@ class MomentTree:
             merged = [_merge_equal(mean[i], squares[i], mean[i + 1], squares[i + 1], 2.0**level) for i in pairs]
             mean, squares = [m for m, _ in merged], [s for _, s in merged]
             level, start = level + 1, start // 2
+        self._close()
 
     def absorb(self, other: MomentTree) -> None:
         """Take in the realizations of another tree, which is used up."""
         self.count += other.count
+        self.whole = self.whole or other.whole
         for place, node in other.waiting.items():
             level, start = place
             while (sibling := self.waiting.pop((level, start ^ 1), None)) is not None:
@@ -95,10 +102,13 @@ class MomentTree:
                 node = _merge_equal(*left, *right, 2.0**level)
                 level, start = level + 1, start // 2
             self.waiting[level, start] = node
-        other.waiting = {}
+        other.waiting, other.whole = {}, None
+        self._close()
 
     def result(self) -> Moments:
         """The moments of all realizations taken in."""
+        if self.whole is not None:
+            return self.whole
         nodes = sorted(self.waiting.items(), key=lambda item: item[0][1] << item[0][0])
         if not nodes:
             raise ValueError("no realizations were taken in")
@@ -107,6 +117,17 @@ class MomentTree:
             for (level, _), (mean, squares) in nodes
         ]
         return merged(parts)
+
+    def held(self) -> list[range]:
+        """The realizations taken in, as ranges in order."""
+        if self.whole is not None:
+            return [range(self.whole.count)]
+        return joined(range(i << level, (i + 1) << level) for level, i in self.waiting)
+
+    def _close(self) -> None:
+        """One node in place of those that wait, once every realization is in."""
+        if self.waiting and self.count == self.size:
+            self.whole, self.waiting = self.result(), {}
 
 
 class EnsembleMoments:
@@ -121,23 +142,98 @@ class EnsembleMoments:
         self.edges = [realizations * block // n_blocks for block in range(n_blocks + 1)]
         self.trees: dict[tuple[str, int], MomentTree] = {}
 
+    def _tree(self, name: str, block: int) -> MomentTree:
+        size = self.edges[block + 1] - self.edges[block]
+        return self.trees.setdefault((name, block), MomentTree(size))
+
     def add(self, first: int, measured: Mapping[str, Tensor]) -> None:
         """Take in measurements (realization, ...) of realizations first, first + 1, ..."""
         for name, values in measured.items():
             for block, (low, high) in enumerate(zip(self.edges, self.edges[1:], strict=False)):
                 begin, end = max(low, first), min(high, first + len(values))
                 if begin < end:
-                    tree = self.trees.setdefault((name, block), MomentTree())
-                    tree.add(begin - low, values[begin - first : end - first])
+                    self._tree(name, block).add(begin - low, values[begin - first : end - first])
 
     def absorb(self, other: EnsembleMoments) -> None:
         """Take in another part of the same ensemble, which is used up."""
-        for key, tree in other.trees.items():
-            self.trees.setdefault(key, MomentTree()).absorb(tree)
+        for (name, block), tree in other.trees.items():
+            self._tree(name, block).absorb(tree)
 
     def blocks(self, name: str) -> list[Moments]:
         """The moments of every block, in order."""
         return [self.trees[name, block].result() for block in range(len(self.edges) - 1)]
+
+    def held(self) -> list[range]:
+        """The realizations taken in, as ranges in order.
+
+        Raises:
+            ValueError: if the measurements differ in their realizations.
+        """
+        found: dict[str, list[range]] = {}
+        for (name, block), tree in self.trees.items():
+            low = self.edges[block]
+            found.setdefault(name, []).extend(range(low + r.start, low + r.stop) for r in tree.held())
+        ranges = [joined(parts) for parts in found.values()]
+        if any(other != ranges[0] for other in ranges):
+            raise ValueError("the measurements differ in their realizations")
+        return ranges[0] if ranges else []
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All nodes by name, as :meth:`from_tensors` takes them: "name/block/level/i/mean" and ".../squares"."""
+        plain: dict[str, Tensor] = {}
+        for (name, block), tree in self.trees.items():
+            nodes = {f"{level}/{i}": node for (level, i), node in tree.waiting.items()}
+            if tree.whole is not None:
+                nodes["whole"] = (tree.whole.mean, tree.whole.squares)
+            for place, (mean, squares) in nodes.items():
+                plain[f"{name}/{block}/{place}/mean"] = mean.contiguous()
+                if squares is not None:
+                    plain[f"{name}/{block}/{place}/squares"] = squares.contiguous()
+        return plain
+
+    @classmethod
+    def from_tensors(cls, realizations: int, n_blocks: int, plain: Mapping[str, Tensor]) -> EnsembleMoments:
+        """The inverse of :meth:`tensors`.
+
+        Raises:
+            ValueError, KeyError: for names or realizations that :meth:`tensors` does not give.
+        """
+        moments = cls(realizations, n_blocks)
+        for key, mean in plain.items():
+            name, block, *place, kind = key.split("/")
+            if kind != "mean":
+                continue
+            tree = moments._tree(name, int(block))
+            squares = plain.get(key.removesuffix("mean") + "squares")
+            if place == ["whole"]:
+                assert tree.size is not None
+                tree.count, tree.whole = (
+                    tree.size,
+                    Moments(tree.size, mean, plain[key.removesuffix("mean") + "squares"]),
+                )
+            else:
+                level, i = (int(word) for word in place)
+                tree.waiting[level, i] = (mean, squares)
+                tree.count += 2**level
+        moments.held()
+        return moments
+
+
+def joined(ranges: Iterable[range]) -> list[range]:
+    """Ranges of whole numbers in order, those that touch as one.
+
+    Raises:
+        ValueError: if two overlap.
+    """
+    whole: list[range] = []
+    for part in sorted(ranges, key=lambda part: part.start):
+        if whole and part.start < whole[-1].stop:
+            raise ValueError(f"realization {part.start} is held twice")
+        if whole and part.start == whole[-1].stop:
+            whole[-1] = range(whole[-1].start, part.stop)
+        elif len(part):
+            whole.append(part)
+    return whole
 
 
 def merged(parts: list[Moments]) -> Moments:

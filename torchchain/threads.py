@@ -59,6 +59,7 @@ def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], workers:
     alone()  # the caller's own products too, while the workers hold the cores
     pool = ThreadPoolExecutor(workers, thread_name_prefix="torchchain", initializer=alone)
     waiting: deque[Future[Result]] = deque()
+    wait = True
     try:
         for item in items:
             waiting.append(pool.submit(work, item))
@@ -66,6 +67,9 @@ def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], workers:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+    except (KeyboardInterrupt, GeneratorExit):
+        wait = False  # nobody wants what is under way
+        raise
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        pool.shutdown(wait=wait, cancel_futures=True)
         torch.set_num_threads(before)

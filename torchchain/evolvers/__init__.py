@@ -6,7 +6,7 @@ from typing import Any
 
 from torchchain import checks
 from torchchain.chain import Chain
-from torchchain.evolvers import chebyshev, damped, modes, ode, symplectic4, tridiagonal, verlet
+from torchchain.evolvers import chebyshev, damped, linearity, modes, ode, symplectic4, tridiagonal, verlet
 from torchchain.evolvers.method import Advance, Method, Trajectory
 from torchchain.excitation import State
 
@@ -41,8 +41,13 @@ def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **opti
 
     Raises:
         FieldError, FieldTypeError: for times, a method, an option or a chain that the method cannot treat.
+
+    Warns:
+        LinearityWarning: for linear contacts that the start would open (elongation 1, the initial overlap).
     """
-    return start(chain, state, method, **options)(checks.times("times", times).to(state.displacement.device))
+    advance = start(chain, state, method, **options)
+    linearity.warn_if_nonlinear(chain, state, linearity.DEVIATION_WHERE_OPEN, stacklevel=3)
+    return advance(checks.times("times", times).to(state.displacement.device))
 
 
 def start(chain: Chain, state: State, method: str, **options: Any) -> Advance:

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import Chain
+from torchchain.evolvers import phase
 from torchchain.evolvers.method import Advance, Method, Trajectory
 from torchchain.excitation import State
 
@@ -40,6 +41,7 @@ LEAP = 256.0
 SEGMENTS = 1024
 SWEEPS = 8  # of the bound's power iteration: within 2 % of the highest frequency, or of 30 sweeps
 ROUNDING = 2.0**-53
+MOST_PHASE = 1e10  # W t, twice the number of stencils
 
 
 def start(
@@ -207,6 +209,18 @@ def _bessel(z: np.ndarray) -> np.ndarray:
     return np.where(tiny, series, values)
 
 
+def check_work(times: Tensor, frequency: float) -> None:
+    """An error where W t asks for more stencils than anyone waits for; the rounding of W t is far from felt there."""
+    end = times.detach().amax().item()
+    if not frequency * end <= MOST_PHASE:
+        raise checks.fail(
+            "times",
+            f"be at most {MOST_PHASE / frequency:.3g} for method 'chebyshev', which takes W t / 2 stencils (W t <= "
+            f"{MOST_PHASE:.0e}, W = {frequency:.4g} being set by the lightest particles)",
+            end,
+        )
+
+
 def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> Advance:
     """The expansion in plain torch, from each output time to the next."""
     axis = len(chain.batch_shape)
@@ -235,6 +249,8 @@ def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> A
 
     def advance(times: Tensor) -> Trajectory:
         nonlocal pair, now
+        check_work(times, frequencies.max())
+        phase.check(times, frequency, pair.dtype)
         outputs = []
         for t in _later(times, now).tolist():
             # Each realization takes the leaps it needs by itself, and then rests.
@@ -294,9 +310,14 @@ class CompiledAdvance:
         self._shape, self._n, self._dtype = state.displacement.shape[:-1], n, state.displacement.dtype
         self._now = 0.0
 
+    def check_work(self, times: Tensor) -> None:
+        """See :func:`check_work`."""
+        check_work(times, float(self.rows.frequencies.max()))
+
     def __call__(self, times: Tensor) -> Trajectory:
         from torchchain.evolvers import stencil
 
+        self.check_work(times)
         later = _later(times, self._now)
         out = torch.empty((2, self.rows.count, len(later), self._n), dtype=self._dtype)
         steps, states = later.numpy(), out.numpy()

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import Chain
+from torchchain.evolvers import phase
 from torchchain.evolvers.method import Advance, Method, Trajectory
 from torchchain.evolvers.modes import align_modes, modal_amplitudes
 from torchchain.excitation import State
@@ -58,6 +59,7 @@ def start(chain: Chain, state: State) -> Advance:
     slack = 1 + torch.finfo(matrix.dtype).eps ** 0.5
 
     def advance(times: Tensor) -> Trajectory:
+        phase.check(times, w, w.dtype)
         z = propagate(times.to(matrix)).reshape(*initial.shape[:-2], len(times), 2 * n_modes)
         energy = z.square().sum(-1) / 2
         bad = ~(energy.detach() <= slack * initial_energy.detach())

@@ -20,30 +20,31 @@ def total(chain: Chain, displacement: Tensor, velocity: Tensor) -> Tensor:
     return kinetic.sum(-1) / 2 + chain.contact_energy(displacement).sum(-1)
 
 
-def check(chain: Chain, trajectory: Trajectory, initial: Tensor, allowed: float, remedy: str) -> None:
+def check(chain: Chain, trajectory: Trajectory, initial: Tensor, allowed: Tensor | float, remedy: str) -> None:
     """An error where the energy kept and dissipated differs from the initial one by more than the fraction allowed.
 
     Args:
         chain: the chain of the trajectory.
         trajectory: the states to check.
         initial: energy at time 0, (*batch, *any).
-        allowed: largest relative deviation; not a number never passes.
+        allowed: largest relative deviation, a number or (*batch, *any); an energy that is not a number never passes.
         remedy: what the user can do, for the message.
 
     Raises:
         EnergyDriftError: naming the realization and the time.
     """
     with torch.no_grad():
+        allowed = torch.as_tensor(allowed, dtype=initial.dtype, device=initial.device).expand(initial.shape)
         energy = total(chain, trajectory.displacement, trajectory.velocity)
         if trajectory.dissipated is not None:
             energy = energy + trajectory.dissipated
         drift = (energy - initial[..., None]).abs()
-        bad = ~(drift <= allowed * initial[..., None])
+        bad = ~(drift <= (allowed * initial)[..., None])
         if not bool(bad.any()):
             return
         where = tuple(int(i) for i in bad.nonzero()[0])
         raise EnergyDriftError(
-            f"energy must stay within {allowed:.2g} of its initial {initial[where[:-1]].item():.4g}, got "
+            f"energy must stay within {allowed[where[:-1]].item():.2g} of its initial {initial[where[:-1]].item():.4g}, got "
             f"{energy[where].item():.4g} at time {trajectory.times[where[-1]].item():g}"
             f"{checks.position(where[:-1])} ({remedy})"
         )

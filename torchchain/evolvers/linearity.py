@@ -13,6 +13,9 @@ from torchchain.chain import Chain
 from torchchain.evolvers.method import Trajectory
 from torchchain.excitation import State
 
+DEVIATION_WHERE_OPEN = 1 / 3
+"""|F / F_linear - 1| of a Hertz contact that is just open."""
+
 
 class LinearityWarning(UserWarning):
     """Linear contacts asked for amplitudes at which real ones are markedly nonlinear, or open."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchchain.chain import Chain
+from torchchain.evolvers import phase
 from torchchain.evolvers.method import Advance, Method, Trajectory
 from torchchain.excitation import State
 from torchchain.spectrum import NormalModes, normal_modes
@@ -40,7 +41,10 @@ def align_modes(chain: Chain, shapes: Tensor, field: Tensor) -> Tensor:
 
 
 def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """From times to position and speed of every mode at each, (*batch, *any, time, mode) (Eq. 20)."""
+    """From times to position and speed of every mode at each, (*batch, *any, time, mode) (Eq. 20).
+
+    Times at which rounding has blurred the phases warn, and far beyond raise; see :func:`phase.check`.
+    """
     displacement, velocity = (z[..., None, :] for z in modal_amplitudes(chain, state, modes))
     frequency = chain.align(modes.frequencies, state.displacement)[..., None, :]
     moves = state.velocity.requires_grad or bool((state.velocity != 0).any())
@@ -48,17 +52,18 @@ def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Te
 
     def motion(times: Tensor) -> tuple[Tensor, Tensor]:
         t = times.to(state.displacement)[:, None]
-        phase = frequency * t
-        cosine = phase.cos()
+        phase.check(times, modes.frequencies, torch.promote_types(frequency.dtype, t.dtype))
+        angle = frequency * t
+        cosine = angle.cos()
         position = speed = torch.zeros_like(displacement)
         if displaced:
             position = cosine * displacement
-            speed = (-frequency * phase.sin()) * displacement
+            speed = (-frequency * angle.sin()) * displacement
         if moves:
             # sin(w t) / w, which is t for the zero mode of a periodic chain (Eq. 21 divides by its w = 0)
-            position = position + (t * torch.sinc(phase / math.pi)) * velocity
+            position = position + (t * torch.sinc(angle / math.pi)) * velocity
             speed = speed + cosine * velocity
-        shape = torch.broadcast_shapes(position.shape, phase.shape)
+        shape = torch.broadcast_shapes(position.shape, angle.shape)
         return position.expand(shape), speed.expand(shape)
 
     return motion

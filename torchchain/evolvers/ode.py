@@ -7,6 +7,9 @@ contacts, damping and gradients come with that; symplecticity does not, and the 
 ``openings`` counts the different contacts found open at the start of any accepted step (for ``lsoda``, at any
 evaluation) or at any output, up to each time. An open Hertz contact does not damp.
 
+A batch shares its steps, chosen for its most demanding state: a chain's result depends on what it is batched with,
+within the tolerance. The chain's own methods do not have that, nor has a fixed ``step`` that is given.
+
 torchdiffeq's ``euler`` is left out: it multiplies the amplitude of a mode by 1 + (w step)^2 / 2 at every step.
 """
 
@@ -50,9 +53,8 @@ class _Motion:
         self.n = chain.n_particles
         self.weight = 1 / chain.align(chain.masses, state.displacement)
         self.hertz, self.damped = chain.contact == "hertz", chain.is_damped
-        self.damping = chain.align(chain.contact_damping, chain.elongation(state.displacement))
-        amplitude = torch.stack([state.displacement, state.velocity]).detach().abs().amax().item()
-        self.amplitude = amplitude if amplitude > 0 else 1.0
+        amplitude = torch.stack([state.displacement, state.velocity]).detach().abs().amax((0, -1))
+        self.amplitude = torch.where(amplitude > 0, amplitude, 1.0)  # (*batch, *any)
         self.opened_at = torch.full_like(chain.elongation(state.displacement.detach()), math.inf)
         self.since, self.note_calls = 0.0, False
 
@@ -64,9 +66,9 @@ class _Motion:
         rates = [velocity]
         if self.damped:
             rate = self.chain.elongation(velocity)
-            damping = self.damping * ~self.chain.open_contacts(displacement) if self.hertz else self.damping
+            damping = self.chain.active_damping(displacement)
             tension = tension + damping * rate
-            power = (damping * rate.square()).sum(-1, keepdim=True) / self.amplitude
+            power = ((damping * rate.square()).sum(-1) / self.amplitude)[..., None]
         rates.append(self.weight * self.chain.net(tension))
         return torch.cat([*rates, power] if self.damped else rates, dim=-1)
 
@@ -139,7 +141,7 @@ def _evolve(
             times,
             stacked[..., :n],
             stacked[..., n : 2 * n],
-            stacked[..., -1] * motion.amplitude if motion.damped else None,
+            stacked[..., -1] * motion.amplitude[..., None] if motion.damped else None,
             openings,
         )
         drift.check(chain, trajectory, initial, ALLOWED_DRIFT, remedy)
@@ -167,6 +169,7 @@ def _start_adaptive(
         grid = torch.tensor([0.0, *(time - now for time in times)], dtype=torch.float64, device=y.device)
         motion.since, motion.note_calls = now, solver.torchdiffeq == "scipy_solver"
         options = dict(solver.options)
+        absolute = (rtol * motion.amplitude)[..., None].expand(y.shape) if atol is None else torch.tensor(atol).to(y)
         if not motion.note_calls:
             motion.callback_accept_step = motion.note_step  # type: ignore[attr-defined]
             # Outputs that are steps: what it interpolates from is less accurate than its steps.
@@ -177,7 +180,7 @@ def _start_adaptive(
                 y,
                 grid,
                 rtol=rtol,
-                atol=rtol * motion.amplitude if atol is None else atol,
+                atol=absolute.cpu().flatten().numpy() if motion.note_calls else absolute,
                 method=solver.torchdiffeq,
                 options=options,
             )
@@ -212,7 +215,7 @@ def _start_fixed(solver: _Solver, chain: Chain, state: State, step: float | None
     def integrate(motion: _Motion, y: Tensor, now: float, times: list[float]) -> list[Tensor]:
         series: list[Tensor] = []
         motion.callback_step = motion.note_step  # type: ignore[attr-defined]
-        counts = substeps(now, times, step)
+        counts = substeps(now, times, step).tolist()
         starts = [now, *times[:-1]]
         lengths = [(end - begin) / count for begin, end, count in zip(starts, times, counts, strict=True)]
         first = 0
@@ -319,7 +322,7 @@ METHODS = tuple(
         _start_adaptive,
         {
             "rtol": f"relative error per step (default {torch.finfo(torch.float64).eps ** solver.rtol:.1g} in float64)",
-            "atol": "absolute error per step (default rtol times the start's largest displacement or velocity)",
+            "atol": "absolute error per step (default rtol times each start's largest displacement or velocity)",
         },
     )
     for solver in ADAPTIVE
@@ -327,7 +330,7 @@ METHODS = tuple(
     _entry(
         solver,
         _start_fixed,
-        {"step": "largest step; outputs are reached by equal steps of at most that (default 0.1 / w_max)"},
+        {"step": "largest step; outputs are reached by equal steps of at most that (default 0.1 / w_max of the batch)"},
     )
     for solver in FIXED
 )

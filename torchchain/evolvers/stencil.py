@@ -1,4 +1,4 @@
-"""Chebyshev propagation with one chain kept in cache: the Numba kernels behind :mod:`chebyshev` and :mod:`fused`.
+"""Chebyshev propagation with one chain kept in cache: the Numba kernels behind :mod:`chebyshev` and :mod:`torchchain.fused`.
 
 A state at time t is a sum of Chebyshev polynomials T_k(x) of x = 1 - 2 A / W^2, A = -M^-1 K, applied to the state
 (u, v) at an earlier *anchor*:

@@ -5,7 +5,8 @@ solved exactly, so any sequence of them is symplectic. Two implementations are t
 is differentiable and runs on any device, and a numba loop for CPU tensors that need no gradient.
 
 ``openings`` counts the different contacts found open at any evaluation of the forces (in ``verlet``, every step) or at
-any output, up to each time. An open Hertz contact does not damp.
+any output, up to each time. An open Hertz contact does not damp. Every state of a batch takes the steps that it would
+take alone.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +26,9 @@ from torchchain.evolvers.method import Advance, Trajectory
 from torchchain.excitation import State
 
 Pair = tuple[float, float]
+
+MOST_STEPS = 1e10
+"""From one output time to the next, for methods with a step."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +49,15 @@ class Composition:
 
 
 def highest_frequency(chain: Chain, overlap: Tensor | float = 1.0) -> Tensor:
-    """An upper bound on the frequencies of contacts with at most this overlap (initially 1), (*batch,).
+    """An upper bound on the frequencies of contacts with at most this overlap (initially 1), (*batch,) or as the overlap.
 
-    A Hertz contact is stiffer than at the initial overlap by the square root of its overlap.
+    A Hertz contact is stiffer than at the initial overlap by the square root of its overlap, (*batch, *any).
     """
     with torch.no_grad():
         squared = chain.squared_frequency_bound()
         if chain.contact == "hertz":
-            squared = squared * torch.as_tensor(overlap).clamp(min=1).sqrt()
+            overlap = torch.as_tensor(overlap)
+            squared = squared[(..., *[None] * (overlap.ndim - squared.ndim))] * overlap.clamp(min=1).sqrt()
         return squared.sqrt()
 
 
@@ -60,44 +66,52 @@ def damping_rate(chain: Chain) -> Tensor:
     with torch.no_grad():
         damping = chain.contact_damping
         # The bound for stiffness serves; a contact without damping gets as little as makes no difference.
-        as_stiffness = damping.clamp(min=1e-12 * damping.amax().item())
+        least = (1e-12 * damping.amax(-1, keepdim=True)).clamp(min=torch.finfo(damping.dtype).tiny ** 0.5)
+        as_stiffness = torch.maximum(damping, least)
         return replace(chain, stiffness=as_stiffness, contact="linear", damping=0.0).squared_frequency_bound()
 
 
 def largest_overlap(chain: Chain, state: State) -> Tensor:
-    """The largest overlap that the state's energy allows any Hertz contact, now and later, (*batch,).
+    """The largest overlap that the state's energy allows any Hertz contact, now and later, (*batch, *any).
 
     The energy of a contact compressed by x is at least kappa x^2 / 2, and no contact can hold more than all of it.
     """
     with torch.no_grad():
         energy = drift.total(chain, state.displacement, state.velocity)
-        energy = energy.reshape(*chain.batch_shape, -1).amax(-1)
-        return 1 + (2 * energy / chain.contact_stiffness.amin(-1)).sqrt()
+        return 1 + (2 * energy / _of_states(chain, chain.contact_stiffness.amin(-1), state)).sqrt()
 
 
 def initial_overlap(chain: Chain, state: State) -> Tensor:
-    """The largest overlap of any contact of the state, (*batch,)."""
+    """The largest overlap of any contact of the state, (*batch, *any)."""
     with torch.no_grad():
-        elongation = chain.elongation(state.displacement)
-        return 1 - elongation.reshape(*chain.batch_shape, -1).amin(-1)
+        return 1 - chain.elongation(state.displacement).amin(-1)
 
 
-def checked_step(chain: Chain, state: State, composition: Composition, method: str, step: float | None) -> float:
-    """The step, if it is stable, or the default step, which is stable for any motion the energy allows.
+def _of_states(chain: Chain, values: Tensor, state: State) -> Tensor:
+    """Values of the chains (*batch,) as values of their states (*batch, *any)."""
+    members = state.displacement.ndim - 1 - values.ndim
+    return values[(..., *[None] * members)].expand(state.displacement.shape[:-1])
+
+
+def checked_step(chain: Chain, state: State, composition: Composition, method: str, step: float | None) -> Tensor:
+    """The step of each state, (*batch, *any): the given one, if it is stable, or the default.
+
+    The default is stable for any motion the state's energy allows, and does not depend on the rest of a batch.
 
     Raises:
         FieldError: for a step at or beyond the stability limit of the chain (at the start's overlaps for Hertz contacts).
     """
     damping = damping_rate(chain) if chain.is_damped else None
     if step is None:
-        default = composition.default / highest_frequency(chain, largest_overlap(chain, state))
-        return (default if damping is None else torch.minimum(default, 0.5 / damping)).amin().item()
+        highest = highest_frequency(chain, largest_overlap(chain, state))
+        default = composition.default / (highest if chain.contact == "hertz" else _of_states(chain, highest, state))
+        return default if damping is None else torch.minimum(default, 0.5 / _of_states(chain, damping, state))
     step = checks.number("step", step, above=0)
     rates = [("w_max", composition.limit, highest_frequency(chain, initial_overlap(chain, state)))]
     if damping is not None:
         rates.append(("d_max", 2.0, damping))
     check_limits(step, method, rates)
-    return step
+    return torch.full(state.displacement.shape[:-1], step, dtype=torch.float64, device=state.displacement.device)
 
 
 def check_limits(step: float, method: str, rates: Sequence[tuple[str, float | None, Tensor]]) -> None:
@@ -114,37 +128,46 @@ def check_limits(step: float, method: str, rates: Sequence[tuple[str, float | No
             )
 
 
-def substeps(now: float, times: list[float], step: float) -> list[int]:
-    """How many equal steps of at most ``step`` lead from each time to the next, the first from ``now``."""
-    counts = []
-    for time in times:
-        # A ratio that only rounding puts above an integer does not cost another step.
-        counts.append(math.ceil((time - now) / step * (1 - 1e-9)))
-        now = time
-    return counts
+def substeps(now: float, times: list[float], step: Tensor | float) -> np.ndarray:
+    """How many equal steps of at most ``step`` (*any,) lead from each time to the next, the first from ``now``, (*any, time)."""
+    spans = np.diff(times, prepend=now)
+    ratio = spans / torch.as_tensor(step, dtype=torch.float64).cpu().numpy()[..., None]
+    if not ratio.max() <= MOST_STEPS:
+        where = tuple(int(i) for i in np.argwhere(ratio == ratio.max())[0])
+        raise checks.fail(
+            "times",
+            f"lie at most {MOST_STEPS:.0e} steps apart (methods 'modes' and 'damped' have no steps)",
+            f"{ratio.max():.3g}{checks.position(where[:-1])}",
+        )
+    # A ratio that only rounding puts above an integer does not cost another step.
+    return np.ceil(ratio * (1 - 1e-9)).astype(np.int64)
 
 
 def start(chain: Chain, state: State, composition: Composition, method: str, step: float | None) -> Advance:
     """The evolution by a composition, its step checked."""
-    step = checked_step(chain, state, composition, method, step)
-    advance = march(chain, state, composition, step)
+    steps = checked_step(chain, state, composition, method, step)
+    advance = march(chain, state, composition, steps)
     if chain.contact == "linear":
         return advance
     initial = drift.total(chain, state.displacement, state.velocity).detach()
     # A stable step lets the energy of a mode swing by (w h)^2 / 4 over 1 minus that in Verlet's case; more is a drift.
-    ratio = step * highest_frequency(chain, initial_overlap(chain, state)).amax().item() / composition.limit
-    allowed = 0.1 + ratio**2 / (1 - ratio**2) if ratio < 1 else 0.1
+    ratio = steps * highest_frequency(chain, initial_overlap(chain, state)) / composition.limit
+    allowed = torch.where(ratio < 1, 0.1 + ratio**2 / (1 - ratio**2), 0.1)
+    remedy = f"method '{method}' with step {steps.amax().item():.4g}: use a smaller step"
 
     def guarded(times: Tensor) -> Trajectory:
         trajectory = advance(times)
-        drift.check(chain, trajectory, initial, allowed, f"method '{method}' with step {step:.4g}: use a smaller step")
+        drift.check(chain, trajectory, initial, allowed, remedy)
         return trajectory
 
     return guarded
 
 
-def march(chain: Chain, state: State, composition: Composition, step: float) -> Advance:
-    """The evolution by a composition with steps of at most ``step``, which nothing here checks for stability."""
+def march(chain: Chain, state: State, composition: Composition, step: Tensor | float) -> Advance:
+    """The evolution by a composition with steps of at most ``step``, a number or one per state (*batch, *any).
+
+    Nothing here checks them for stability.
+    """
     dtype = torch.promote_types(chain.masses.dtype, state.displacement.dtype)
     chain = replace(chain, masses=chain.masses.to(dtype))
     state = State(state.displacement.to(dtype), state.velocity.to(dtype))
@@ -154,29 +177,31 @@ def march(chain: Chain, state: State, composition: Composition, step: float) -> 
     return (_rows if compiled else _tensors)(chain, state, composition, step)
 
 
-def _tensors(chain: Chain, state: State, composition: Composition, step: float) -> Advance:
-    """Plain torch: any device, differentiable, new tensors at every step."""
-    hertz, damped = chain.contact == "hertz", chain.is_damped
+def _tensors(chain: Chain, state: State, composition: Composition, step: Tensor | float) -> Advance:
+    """Plain torch: any device, differentiable, new tensors at every step; a state that is done rests in steps of zero."""
+    hertz, damped, dtype = chain.contact == "hertz", chain.is_damped, state.displacement.dtype
     weight = 1 / chain.align(chain.masses, state.displacement)
     displacement, velocity = state.displacement, state.velocity
     lost = torch.zeros_like(displacement[..., 0])
     peak = chain.elongation(displacement.detach())
-    damping = chain.align(chain.contact_damping, peak)
+    step = torch.as_tensor(step, dtype=torch.float64, device=displacement.device).expand(displacement.shape[:-1])
     now = 0.0
 
-    def apply(pair: Pair, h: float) -> None:
+    def apply(*pairs: tuple[Pair, Tensor]) -> None:
+        """Drifts and kicks for fractions of steps (*batch, *any, 1), those of several pairs at once."""
         nonlocal displacement, velocity, peak
-        if pair[0] != 0:
-            displacement = displacement + pair[0] * h * velocity
-        if pair[1] != 0:
+        drifts, kicks = ([fraction[k] * h for fraction, h in pairs if fraction[k] != 0] for k in (0, 1))
+        if drifts:
+            displacement = displacement + torch.stack(drifts).sum(0) * velocity
+        if kicks:
             elongation = chain.elongation(displacement)
             if hertz:
                 peak = torch.maximum(peak, elongation.detach())
-            velocity = velocity + pair[1] * h * weight * chain.net(chain.tension(elongation))
+            velocity = velocity + torch.stack(kicks).sum(0) * weight * chain.net(chain.tension(elongation))
 
-    def damp(duration: float) -> None:
+    def damp(duration: Tensor) -> None:
         nonlocal velocity, lost
-        active = damping * ~chain.open_contacts(displacement) if hertz else damping
+        active = chain.active_damping(displacement)
         middle = velocity + duration / 2 * weight * chain.net(active * chain.elongation(velocity))
         pull = duration * chain.net(active * chain.elongation(middle))
         after = velocity + weight * pull
@@ -186,21 +211,27 @@ def _tensors(chain: Chain, state: State, composition: Composition, step: float) 
     def advance(times: Tensor) -> Trajectory:
         nonlocal now, peak
         targets, outputs = _targets(times, now), []
-        for target, count in zip(targets, substeps(now, targets, step), strict=True):
-            h = (target - now) / max(count, 1)
-            if damped and count:
-                damp(h / 2)
-            for i in range(count):
-                last = i + 1 == count
+        counts = torch.from_numpy(substeps(now, targets, step)).to(step.device)
+        for target, count in zip(targets, counts.unbind(-1), strict=True):
+            length = (target - now) / count.clamp(min=1).to(torch.float64)
+
+            def of_step(number: int, count: Tensor = count, length: Tensor = length) -> Tensor:
+                return torch.where(number < count, length, 0.0).to(dtype)[..., None]
+
+            steps = int(count.amax())
+            if damped and steps:
+                damp(of_step(0) / 2)
+            for i in range(steps):
+                h, following = of_step(i), of_step(i + 1)
                 if i == 0 or damped:
-                    apply(composition.opening, h)
+                    apply((composition.opening, h))
                 for pair in composition.middle:
-                    apply(pair, h)
-                (drifted, kicked), (drifts, kicks) = composition.closing, composition.opening
-                # Without damping between them, the end of a step and the start of the next are one drift and one kick.
-                apply((drifted, kicked) if last or damped else (drifted + drifts, kicked + kicks), h)
+                    apply((pair, h))
                 if damped:
-                    damp(h / 2 if last else h)
+                    apply((composition.closing, h))
+                    damp((h + following) / 2)
+                else:  # the end of a step and the start of the next are one drift and one kick
+                    apply((composition.closing, h), (composition.opening, following))
             now = target
             if hertz:
                 peak = torch.maximum(peak, chain.elongation(displacement.detach()))
@@ -217,7 +248,7 @@ def _tensors(chain: Chain, state: State, composition: Composition, step: float) 
     return advance
 
 
-def _rows(chain: Chain, state: State, composition: Composition, step: float) -> Advance:
+def _rows(chain: Chain, state: State, composition: Composition, step: Tensor | float) -> Advance:
     """The compiled loop: float32 or float64 on the CPU, no gradient."""
     from torchchain.evolvers.symplectic_kernel import advance_rows
 
@@ -237,14 +268,14 @@ def _rows(chain: Chain, state: State, composition: Composition, step: float) -> 
         stiffness, damping = (values.reshape(-1, n + 1).contiguous() for values in contacts)
         opening, closing = (torch.tensor(pair, dtype=dtype) for pair in (composition.opening, composition.closing))
         middle = torch.tensor(composition.middle, dtype=dtype).reshape(-1, 2)
+        longest = torch.as_tensor(step, dtype=torch.float64).expand(lead).reshape(-1)
     now = 0.0
 
     def advance(times: Tensor) -> Trajectory:
         nonlocal now
         targets = _targets(times, now)
-        counts = substeps(now, targets, step)
-        spans = [target - before for before, target in zip([now, *targets[:-1]], targets, strict=True)]
-        steps = torch.tensor([span / max(count, 1) for span, count in zip(spans, counts, strict=True)], dtype=dtype)
+        counts = substeps(now, targets, longest)
+        steps = torch.from_numpy(np.diff(targets, prepend=now) / np.maximum(counts, 1)).to(dtype)
         rows, window = len(displacement), len(targets)
         out = [torch.empty(rows, window, n, dtype=dtype) for _ in range(2)]
         losses = torch.empty(rows, window, dtype=dtype)
@@ -258,7 +289,9 @@ def _rows(chain: Chain, state: State, composition: Composition, step: float) -> 
             periodic,
             hertz,
             damped,
-            *(tensor.numpy() for tensor in (opening, middle, closing, torch.tensor(counts), steps, *out)),
+            *(tensor.numpy() for tensor in (opening, middle, closing)),
+            counts,
+            *(tensor.numpy() for tensor in (steps, *out)),
             losses.numpy(),
             openings.numpy(),
         )

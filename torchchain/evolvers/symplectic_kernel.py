@@ -156,7 +156,7 @@ def _advance_rows(
         chain = row // members
         lost[row] = _advance_row(
             displacement[row], velocity[row], peak[row], lost[row], weight[chain], stiffness[chain], damping[chain],
-            periodic, hertz, damped, opening, middle, closing, substeps, steps,
+            periodic, hertz, damped, opening, middle, closing, substeps[row], steps[row],
             displacements[row], velocities[row], losses[row], openings[row],
         )  # fmt: skip
 
@@ -169,7 +169,7 @@ def advance_rows(threads: int, *arguments: Any) -> None:
         arguments: displacement and velocity (row, particle), peak elongation (row, contact + 1) and energy lost
             (row,), all updated; weight 1/m (chain, particle), stiffness and damping (chain, contact + 1), a periodic
             chain's contact 0 being repeated at the end; the flags periodic, hertz and damped; the composition's
-            opening (2,), middle (stage, 2) and closing (2,) drifts and kicks; substeps and their length (time,);
+            opening (2,), middle (stage, 2) and closing (2,) drifts and kicks; substeps and their length (row, time);
             the outputs displacement and velocity (row, time, particle), energy lost and openings (row, time).
     """
     rows = len(arguments[0])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchchain import checks
-from torchchain.master.model import flows
+from torchchain.master.model import flows, swing_in_generator
 
 CONSTRAINTS = ("exact", "penalty")
 
@@ -70,8 +70,14 @@ class FreeRates(nn.Module):
 
 
 def fit_rates(
-    times: Tensor, mean: Tensor, basis: Tensor, initial: Tensor, settings: AdamSettings, progress: Any = None
-) -> tuple[Tensor, dict[str, Any]]:
+    times: Tensor,
+    mean: Tensor,
+    basis: Tensor,
+    initial: Tensor,
+    settings: AdamSettings,
+    progress: Any = None,
+    delay: Tensor | None = None,
+) -> tuple[Tensor, Tensor | None, dict[str, Any]]:
     """Minimize the squared difference between Pi + (I - Pi) exp(Q t) and the ensemble over all times.
 
     Deterministic: it starts from ``initial`` and draws no random number.
@@ -83,27 +89,39 @@ def fit_rates(
         initial: Q to start from.
         settings: see :class:`AdamSettings`.
         progress: called with 1 after every step.
+        delay: tau of :class:`SwingInModel` to start from, fitted too; None for rates that act at once.
 
     Returns:
-        Q [source, receiver] of the smallest loss, and a report: converged, steps, loss, penalty.
+        Q [source, receiver] and tau of the smallest loss, and a report: converged, steps, loss, penalty.
     """
     rest = torch.eye(len(basis), dtype=basis.dtype) - basis
     module: nn.Module = (ConstrainedRates if settings.constraint == "exact" else FreeRates)(initial)
-    optimizer = torch.optim.Adam(module.parameters(), lr=settings.learning_rate)
+    groups: list[dict[str, Any]] = [{"params": list(module.parameters())}]
+    if delay is not None:
+        log_delay = nn.Parameter(delay.log())
+        rest = torch.cat([rest, torch.zeros_like(rest)], dim=1)
+        groups.append({"params": [log_delay], "lr": settings.learning_rate / 10})
+    optimizer = torch.optim.Adam(groups, lr=settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
         optimizer, settings.steps, eta_min=settings.learning_rate / 50
     )
     losses: list[float] = []
-    best, best_rates = float("inf"), initial
+    best, best_rates, best_delay = float("inf"), initial, delay
     converged = False
     for _ in range(settings.steps):
         rates = module()
-        misfit = (basis[:, None] + flows(rest, rates, times) - mean).square().sum(-1).mean()
+        if delay is None:
+            moved = flows(rest, rates, times)
+        else:
+            stages = flows(rest, swing_in_generator(rates, log_delay.exp()), times)
+            moved = stages[..., : len(rates)] + stages[..., len(rates) :]
+        misfit = (basis[:, None] + moved - mean).square().sum(-1).mean()
         leak = rates.sum(-1).square().mean()
         loss = misfit + (settings.penalty * leak if settings.constraint == "penalty" else 0.0)
         value = float(loss.detach())
         if value < best:
             best, best_rates = value, rates.detach().clone()
+            best_delay = None if delay is None else log_delay.detach().exp()
         losses.append(value)
         optimizer.zero_grad()
         loss.backward()
@@ -114,4 +132,4 @@ def fit_rates(
         if len(losses) > 100 and min(losses[:-50]) - best < settings.tolerance * best:
             converged = True
             break
-    return best_rates, {"converged": converged, "steps": len(losses), "loss": best, "first_loss": losses[0]}
+    return best_rates, best_delay, {"converged": converged, "steps": len(losses), "loss": best, "first_loss": losses[0]}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,33 +15,66 @@ from safetensors.torch import save_file
 
 from torchchain import checks
 from torchchain.master.memory import MemoryModel
-from torchchain.master.model import RateModel, TransferModel
+from torchchain.master.model import RateModel, SwingInModel, TransferModel
+from torchchain.master.trust import Uncertainty
 from torchchain.scene import Scene
 
 FORMAT = "torchchain-master-equation"
-FORMAT_VERSION = 1
+FAMILY_FORMAT = "torchchain-master-family"
+FORMAT_VERSION = 2
 CONVENTIONS = {
-    "axes": "rates, basis [source, receiver]; damping [band]; amplitudes [function, source, receiver]",
+    "axes": "rates, basis and their stderr [source, receiver]; damping, delay [band]; amplitudes [function, source, receiver]; stderr [source, time, receiver]",
     "markov": "e(t) = e(0) (basis exp(-damping t) + (1 - basis) exp((rates - damping) t)), row vectors",
+    "swing_in": "like markov, but energy moves only after it was released from rest with the rate 1 / delay",
     "memory": "e(t) = e(0) (basis + sum_m amplitudes[m] f_m(t)) exp(-damping t); f: exponentials, then cosine and sine of pairs",
     "bands": "n_bands equal bands of |k| in (0, pi]; tone n lies in band ceil(n / (n_particles / 2 / n_bands))",
     "units": "mean mass 1, linear contact stiffness 1; time: travel time of sound over one particle",
 }
 LARGEST_FILE = 2**28
-MODELS: dict[str, type[TransferModel]] = {RateModel.kind: RateModel, MemoryModel.kind: MemoryModel}
+MODELS: dict[str, type[TransferModel]] = {kind.kind: kind for kind in (RateModel, SwingInModel, MemoryModel)}
 AXES: dict[str, dict[str, tuple[str, ...]]] = {
     RateModel.kind: {"rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",)},
+    SwingInModel.kind: {
+        "rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",), "delay": ("band",),
+    },
     MemoryModel.kind: {
         "rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",),
         "amplitudes": ("function", "band", "band"), "decay": ("function",),
         "pair_decay": ("function",), "pair_frequency": ("function",),
     },
 }  # fmt: skip
-MOST_FUNCTIONS = 64
+ERROR_AXES = {
+    "rates_stderr": ("band", "band"), "basis_stderr": ("band", "band"),
+    "stderr_times": ("time",), "stderr": ("band", "time", "band"),
+}  # fmt: skip
+"""Of the error bars, which a file holds all or none of."""
+LONGEST_AXIS = 128
+"""Functions, or times of the error bars."""
+MOST_MEMBERS = 64
 
 
-def save(model: TransferModel, record: Mapping[str, Any], path: str | Path) -> None:
-    """Write model and record; the file appears whole or not at all."""
+Member = tuple[TransferModel, dict[str, Any], Uncertainty | None]
+"""A model, its record of calibration, and its error bars."""
+
+
+def save(model: TransferModel, record: Mapping[str, Any], uncertainty: Uncertainty | None, path: str | Path) -> None:
+    """Write model, record and error bars; the file appears whole or not at all."""
+    _write(_described(model, record), _packed(model, uncertainty), path)
+
+
+def save_family(members: Sequence[Member], path: str | Path) -> None:
+    """Write models for several strengths of the disorder in one file."""
+    headers = [_described(model, record) for model, record, _ in members]
+    tensors = {
+        f"{i}.{name}": value
+        for i, (model, _, uncertainty) in enumerate(members)
+        for name, value in _packed(model, uncertainty).items()
+    }
+    _write({"format": FAMILY_FORMAT, "format_version": FORMAT_VERSION, "members": headers}, tensors, path)
+
+
+def _described(model: TransferModel, record: Mapping[str, Any]) -> dict[str, Any]:
+    """The header of a model."""
     import numpy
     import scipy
     import torchdiffeq
@@ -49,7 +82,7 @@ def save(model: TransferModel, record: Mapping[str, Any], path: str | Path) -> N
     from torchchain import __version__
 
     scene: Scene = record["scene"]
-    header = {
+    return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "kind": model.kind,
@@ -69,11 +102,18 @@ def save(model: TransferModel, record: Mapping[str, Any], path: str | Path) -> N
             "torchdiffeq": torchdiffeq.__version__,
         },
     }
+
+
+def _packed(model: TransferModel, uncertainty: Uncertainty | None) -> dict[str, torch.Tensor]:
+    every = model.tensors() | (uncertainty.tensors() if uncertainty is not None else {})
+    return {name: value.detach().cpu().contiguous() for name, value in every.items()}
+
+
+def _write(header: Mapping[str, Any], tensors: dict[str, torch.Tensor], path: str | Path) -> None:
     try:
         metadata = {"torchchain": json.dumps(header, sort_keys=True, allow_nan=False)}
     except ValueError:  # everything else in the header has been checked
-        raise checks.fail("calibration.report", "hold finite numbers", record["report"]) from None
-    tensors = {name: value.detach().cpu().contiguous() for name, value in model.tensors().items()}
+        raise checks.fail("calibration.report", "hold finite numbers", header.get("report")) from None
     path = Path(path)
     try:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
@@ -89,8 +129,17 @@ def save(model: TransferModel, record: Mapping[str, Any], path: str | Path) -> N
         raise checks.fail(f"file {path}", "be writable", f"{getattr(error, 'strerror', None) or error}") from None
 
 
-def load(path: str | Path) -> tuple[TransferModel, dict[str, Any]]:
+def load(path: str | Path) -> Member:
     """Read and check a file written by :func:`save`."""
+    return _load(path, FORMAT)[0]
+
+
+def load_family(path: str | Path) -> list[Member]:
+    """Read and check a file written by :func:`save_family`."""
+    return _load(path, FAMILY_FORMAT)
+
+
+def _load(path: str | Path, expected: str) -> list[Member]:
     path = Path(path)
     where = f"file {path}"
     try:
@@ -100,19 +149,30 @@ def load(path: str | Path) -> tuple[TransferModel, dict[str, Any]]:
         if size > LARGEST_FILE:
             raise checks.fail(where, f"be at most {LARGEST_FILE} bytes", size)
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            header = _header(where, metadata)
-            tensors = _tensors(where, file, header)
+            headers = _headers(where, file.metadata() or {}, expected)
+            tensors = _tensors(where, file, headers, expected)
     except OSError as error:
         raise checks.fail(where, "be a readable file", f"{error.strerror or error}") from None
     except (SafetensorError, ValueError, TypeError, KeyError, OverflowError, MemoryError, RecursionError) as error:
         if isinstance(error, checks.FieldError):
             raise
         raise checks.fail(where, "be a master equation saved by torchchain", checks.shown(str(error))) from None
+    return [_member(where, header, found) for header, found in zip(headers, tensors, strict=True)]
+
+
+def _member(where: str, header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Member:
+    """A model, its record and its error bars from checked header and tensors."""
     try:
+        errors = {name: tensors.pop(name) for name in ERROR_AXES if name in tensors}
+        uncertainty = Uncertainty.from_tensors(**errors) if errors else None
         model = MODELS[header["kind"]](**tensors)
         scene = Scene.from_dict(header["scene"])
         window = None if header["window"] is None else _window(header["window"])
+        report = header["report"]
+        if report.get("horizon", "infinite") != "infinite":
+            checks.number("report.horizon", report["horizon"], at_least=0)
+        if "damping" in report and checks.real_tensor("report.damping", report["damping"]).shape != (scene.n_bands,):
+            raise checks.fail("report.damping", f"hold {scene.n_bands} numbers", report["damping"])
     except (checks.FieldError, checks.FieldTypeError, TypeError) as error:
         raise checks.fail(where, "hold valid fields", f"{error}") from None
     if scene.n_bands != model.n_bands or header["n_bands"] != model.n_bands:
@@ -121,19 +181,28 @@ def load(path: str | Path) -> tuple[TransferModel, dict[str, Any]]:
         )
     if header["strength"] != scene.disorder.strength:
         raise checks.fail(where, "state the strength of its scene", header["strength"])
-    return model, {
-        "method": header["method"],
-        "model": header["model"],
-        "window": window,
-        "scene": scene,
-        "report": header["report"],
-    }
+    record = {"method": header["method"], "model": header["model"], "window": window, "scene": scene, "report": report}
+    return model, record, uncertainty
 
 
-def _header(where: str, metadata: Mapping[str, str]) -> dict[str, Any]:
+def _headers(where: str, metadata: Mapping[str, str], expected: str) -> list[dict[str, Any]]:
+    """The checked headers of the models of a file."""
     if "torchchain" not in metadata:
-        raise checks.fail(where, f"carry the format {FORMAT}", "no such header")
+        raise checks.fail(where, f"carry the format {expected}", "no such header")
     header = json.loads(metadata["torchchain"])
+    if not isinstance(header, dict) or header.get("format") != expected:
+        raise checks.fail(where, f"carry the format {expected}", checks.shown(header))
+    if expected == FORMAT:
+        return [_header(where, header)]
+    version, members = header.get("format_version"), header.get("members")
+    if version != FORMAT_VERSION or isinstance(version, bool):
+        raise checks.fail(where, f"have format version {FORMAT_VERSION}", version)
+    if not isinstance(members, list) or not 1 <= len(members) <= MOST_MEMBERS:
+        raise checks.fail(where, f"have 1 to {MOST_MEMBERS} members", checks.shown(members))
+    return [_header(where, member) for member in members]
+
+
+def _header(where: str, header: Any) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise checks.fail(where, f"carry the format {FORMAT}", checks.shown(header))
     version = header.get("format_version")
@@ -162,17 +231,36 @@ def _header(where: str, metadata: Mapping[str, str]) -> dict[str, Any]:
     return header
 
 
-def _tensors(where: str, file: Any, header: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    expected = AXES[header["kind"]]
+def _tensors(where: str, file: Any, headers: Sequence[Mapping[str, Any]], form: str) -> list[dict[str, torch.Tensor]]:
+    """The tensors of every model of a file, no more and no less than the headers say."""
     names = set(file.keys())
-    if names != set(expected):
-        raise checks.fail(where, f"hold the tensors {', '.join(sorted(expected))}", checks.shown(sorted(names)[:4]))
+    if form == FORMAT:
+        return [_model_tensors(where, file, headers[0], "", names)]
+    found = []
+    for i, header in enumerate(headers):
+        own = {name for name in names if name.startswith(f"{i}.")}
+        names -= own
+        found.append(_model_tensors(where, file, header, f"{i}.", own))
+    if names:
+        raise checks.fail(where, f"hold the tensors of {len(headers)} models", checks.shown(sorted(names)[:4]))
+    return found
+
+
+def _model_tensors(
+    where: str, file: Any, header: Mapping[str, Any], prefix: str, names: set[str]
+) -> dict[str, torch.Tensor]:
+    expected = AXES[header["kind"]]
+    if any(prefix + name in names for name in ERROR_AXES):
+        expected = expected | ERROR_AXES
+    if names != {prefix + name for name in expected}:
+        wanted = ", ".join(sorted(prefix + name for name in expected))
+        raise checks.fail(where, f"hold the tensors {wanted}", checks.shown(sorted(names)[:4]))
     tensors = {}
     for name, axes in expected.items():
-        part = file.get_slice(name)
+        part = file.get_slice(prefix + name)
         shape = tuple(part.get_shape())
         fits = len(shape) == len(axes) and all(
-            size == header["n_bands"] if axis == "band" else size <= MOST_FUNCTIONS
+            size == header["n_bands"] if axis == "band" else size <= LONGEST_AXIS
             for size, axis in zip(shape, axes, strict=True)
         )
         if not fits:
@@ -181,7 +269,7 @@ def _tensors(where: str, file: Any, header: Mapping[str, Any]) -> dict[str, torc
             )
         if part.get_dtype() not in ("F64", "F32"):
             raise checks.fail(where, f"hold {name} as 32 or 64 bit floating point", part.get_dtype())
-        tensors[name] = file.get_tensor(name)
+        tensors[name] = file.get_tensor(prefix + name)
     return tensors
 
 

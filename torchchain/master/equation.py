@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,8 +15,18 @@ from torchchain import checks
 from torchchain.master import artifact
 from torchchain.master.model import TransferModel
 from torchchain.master.solvers import SOLVERS, IntegrationError
+from torchchain.master.trust import Uncertainty
 from torchchain.scene import Scene
 from torchchain.threads import single_thread
+
+NEGATIVE_SHARE = 1e-3
+"""Negative energies of a band up to this share of the total are not worth a warning."""
+GAINED_SHARE = 1e-2
+"""Nor is energy that a model makes, up to this share of the total."""
+
+
+class TrustWarning(UserWarning):
+    """A prediction beyond what the model was compared with, or with energies that cannot be."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +49,14 @@ class MasterEquation(nn.Module):
     Args:
         model: the rate model.
         calibration: where it comes from.
+        uncertainty: standard errors by bootstrap; None if there are none.
     """
 
-    def __init__(self, model: TransferModel, calibration: Calibration) -> None:
+    def __init__(self, model: TransferModel, calibration: Calibration, uncertainty: Uncertainty | None = None) -> None:
         super().__init__()
         self.model = model
         self.calibration = calibration
+        self.uncertainty = uncertainty
 
     @property
     def rates(self) -> Tensor:
@@ -57,19 +71,32 @@ class MasterEquation(nn.Module):
     @property
     def damping(self) -> Tensor:
         """d [band], the dissipation rate of Eq. 51."""
-        return self.model.damping
+        found = self._report.get("damping")
+        return self.model.damping if found is None else torch.tensor(found).to(self.rates)
+
+    @property
+    def _report(self) -> dict[str, Any]:
+        return {} if self.calibration is None else self.calibration.report
+
+    @property
+    def horizon(self) -> float:
+        """Time up to which predictions were compared with chains; infinity where these had settled, or if unknown."""
+        limit = self._report.get("horizon", math.inf)
+        return math.inf if limit == "infinite" else float(limit)
 
     @property
     def n_bands(self) -> int:
         return self.model.n_bands
 
-    def solve(self, initial: Any, times: Any, method: str = "expm", **options: Any) -> Tensor:
+    def solve(self, initial: Any, times: Any, method: str = "expm", *, supply: Any = None, **options: Any) -> Tensor:
         """Band energies at the given times.
 
         Args:
             initial: energy per band at time 0, (*batch, band), in any unit.
             times: (time,), increasing, not negative.
             method: a name in ``SOLVERS``: "expm" or a method of torchdiffeq.
+            supply: energy fed into each band per unit time, (band,) at all times, or (*batch, time, band): constant
+                up to each time from the one before it, from 0 for the first.
             options: the solver's own: ``rtol`` and ``atol``, or ``step``.
 
         Returns:
@@ -78,6 +105,9 @@ class MasterEquation(nn.Module):
         Raises:
             FieldError, FieldTypeError: for a bad argument.
             IntegrationError: if the solver fails, with its numbers.
+
+        Warns:
+            TrustWarning: for times beyond the model's horizon, for a band with a clearly negative energy, and for energy made.
         """
         solver = SOLVERS[checks.choice("method", method, SOLVERS)]
         checks.known_keys(f"options of solver '{method}'", options, solver.options)
@@ -85,11 +115,108 @@ class MasterEquation(nn.Module):
         if initial.ndim == 0 or initial.shape[-1] != self.n_bands:
             raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}")
         times = checks.times("times", times).to(self.rates)
+        fed = None if supply is None else self._supply(supply, initial, times)
         with single_thread():
-            energy = solver.run(self.model, initial, times, **options)
+            energy = solver.run(self.model, initial, times, fed, **options)
         if not bool(energy.isfinite().all()):
             raise IntegrationError(f"solver '{method}' must stay finite, got overflow up to time {float(times[-1]):g}")
+        self._warn(initial, times, fed, energy.detach())
         return energy
+
+    def _supply(self, supply: Any, initial: Tensor, times: Tensor) -> Tensor:
+        supply = checks.real_tensor("supply", supply).to(self.rates)
+        shape = (len(times), self.n_bands)
+        if supply.ndim == 1:
+            supply = supply[None]
+        if supply.ndim == 0 or supply.shape[-1] != self.n_bands or supply.shape[-2] not in (1, len(times)):
+            raise checks.fail("supply", f"have shape {(self.n_bands,)} or (*batch, {shape[0]}, {shape[1]})", f"shape {tuple(supply.shape)}")  # fmt: skip
+        try:
+            batch = torch.broadcast_shapes(supply.shape[:-2], initial.shape[:-1])
+        except RuntimeError:
+            raise checks.fail("supply", f"fit a batch of {tuple(initial.shape[:-1])} starts", f"shape {tuple(supply.shape)}") from None  # fmt: skip
+        return supply.expand(*batch, *shape)
+
+    def _warn(self, initial: Tensor, times: Tensor, fed: Tensor | None, energy: Tensor) -> None:
+        """The warnings of :meth:`solve`; four calls from the user's own line."""
+        end = float(times[-1])
+        if end > self.horizon * (1 + 1e-9):
+            warnings.warn(
+                f"prediction to time {end:g} lies beyond {self.horizon:g}, up to which this model was compared with chains",
+                TrustWarning,
+                stacklevel=3,
+            )
+        if not energy.numel() or bool((initial < 0).any()) or (fed is not None and bool((fed < 0).any())):
+            return
+        total = initial.sum(-1)[..., None]
+        if fed is not None:
+            steps = torch.diff(times, prepend=times.new_zeros(1))
+            total = total + (fed.sum(-1) * steps).cumsum(-1)
+        gained = energy.sum(-1) / total.clamp(min=torch.finfo(total.dtype).tiny) - 1
+        if float(gained.max()) > GAINED_SHARE:
+            when = float(times[int(gained.reshape(-1, len(times)).amax(0).argmax())])
+            warnings.warn(
+                f"predicted energy has grown by {float(gained.max()):.2g} of the total at time {when:g}: rows of the rates "
+                f"that do not sum to zero make energy (conservation_defect {self.conservation_defect:.2g})",
+                TrustWarning,
+                stacklevel=3,
+            )
+        lowest = float((energy.amin(-1) / total.clamp(min=torch.finfo(total.dtype).tiny)).min())
+        if lowest < -NEGATIVE_SHARE:
+            warnings.warn(
+                f"lowest predicted energy of a band is {lowest:.2g} of the total: the model is that uncertain there",
+                TrustWarning,
+                stacklevel=3,
+            )
+
+    def standard_error(self, initial: Any, times: Any) -> Tensor:
+        """Standard error of :meth:`solve`, (*batch, time, band), by bootstrap and with the model's own misfit.
+
+        Args:
+            initial, times: see :meth:`solve`.
+
+        Raises:
+            FieldError: if the calibration has no error bars.
+        """
+        if self.uncertainty is None:
+            raise checks.fail("bootstrap", "be at least 2 in calibrate() for error bars", 0)
+        initial = checks.real_tensor("initial", initial).to(self.rates)
+        if initial.ndim == 0 or initial.shape[-1] != self.n_bands:
+            raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}")
+        return self.uncertainty.of(initial, checks.times("times", times).to(self.rates))
+
+    def dissipated(self, initial: Any, times: Any) -> Tensor:
+        """Energy lost to damping up to each time, (*batch, time): what :meth:`solve` leaves of the start is the rest."""
+        initial = checks.real_tensor("initial", initial).to(self.rates)
+        return initial.sum(-1)[..., None] - self.solve(initial, times).sum(-1)
+
+    def concerns(self, scene: Scene) -> list[str]:
+        """What of a scene this model was not calibrated for, in words; empty if nothing.
+
+        Bands and boundary cannot be changed afterwards; disorder within 1e-9 only, unless the model is one of a range of
+        strengths. The chain's length may change where the wave has not yet gone round: the rates belong to bands, not to tones.
+        """
+        own, found = self.calibration.scene, []
+        for name, label in (
+            ("n_bands", "bands"),
+            ("boundary", "boundary"),
+            ("damping", "damping"),
+            ("contact", "contact"),
+        ):
+            if getattr(scene, name) != getattr(own, name):
+                found.append(f"{label} {getattr(scene, name)}, calibrated on {getattr(own, name)}")
+        if scene.disorder.kind != own.disorder.kind or scene.stiffness_disorder != own.stiffness_disorder:
+            found.append("another kind of disorder")
+        if abs(scene.disorder.strength - own.disorder.strength) > 1e-9:
+            found.append(f"disorder {scene.disorder.strength:g}, calibrated on {own.disorder.strength:g}")
+        end = float(scene.times[-1])
+        if end > self.horizon:
+            found.append(f"times to {end:g}, compared with chains to {self.horizon:g}")
+        shorter = min(scene.n_particles, own.n_particles)
+        if scene.n_particles != own.n_particles and end > shorter:
+            found.append(
+                f"{scene.n_particles} particles, calibrated on {own.n_particles}, and waves that go round by t = {shorter}"
+            )
+        return found
 
     def forward(self, initial: Tensor, times: Tensor) -> Tensor:
         """:meth:`solve` by the matrix exponential."""
@@ -108,7 +235,7 @@ class MasterEquation(nn.Module):
 
     def save(self, path: str | Path) -> None:
         """Write the model as safetensors, all or nothing."""
-        artifact.save(self.model, self.calibration.__dict__, path)
+        artifact.save(self.model, self.calibration.__dict__, self.uncertainty, path)
 
     @classmethod
     def load(cls, path: str | Path) -> MasterEquation:
@@ -117,5 +244,5 @@ class MasterEquation(nn.Module):
         Raises:
             FieldError: naming the file and what is wrong with it.
         """
-        model, record = artifact.load(path)
-        return cls(model, Calibration(**record))
+        model, record, uncertainty = artifact.load(path)
+        return cls(model, Calibration(**record), uncertainty)

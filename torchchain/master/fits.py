@@ -46,6 +46,20 @@ def linear_rates(times: Tensor, mean: Tensor, free: Tensor, window: tuple[float,
     return slope / free[:, None]
 
 
+def linear_delay(times: Tensor, mean: Tensor, window: tuple[float, float]) -> Tensor:
+    """t0 of Section 3.5, scalar: where the lines of procedure L, drawn back from the window, reach the start.
+
+    The mean over the sources' own bands, each weighted with its loss rate; no less than a hundredth of the window's
+    beginning or end.
+    """
+    inside = within(times, window, 2)
+    t = times[inside] - times[inside].mean()
+    own = mean[:, inside].diagonal(dim1=0, dim2=2).T  # [source, time]
+    slope = (own @ t) / t.square().sum()
+    lost = own.mean(-1) - 1 - slope * times[inside].mean()  # the line at time 0, minus the start
+    return (-(lost * slope).sum() / slope.square().sum().clamp(min=1e-300)).clamp(min=0.01 * window[1], max=window[1])
+
+
 def profile(n_bands: int) -> Tensor:
     """sin^2(pi min(s, r) / (2 B)) off the diagonal, minus the row sum on it: Eq. 50 for q0 = 1, [source, receiver]."""
     band = torch.arange(1, n_bands + 1, dtype=torch.float64)

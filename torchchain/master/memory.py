@@ -15,7 +15,8 @@ from torchchain import checks
 from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping
 
 SLOWEST, FASTEST = 1e-4, 6.0
-LADDER = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 3), (3, 3), (2, 4))
+LADDER = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 3), (2, 4), (3, 4), (3, 5), (3, 6), (4, 6), (5, 8))
+"""Orders that are tried one after the other: numbers of exponentials and of pairs."""
 
 
 class MemoryModel(TransferModel):
@@ -195,6 +196,7 @@ def fit_memory(
     order: tuple[int, int],
     starts: int = 6,
     progress: Callable[[int], Any] | None = None,
+    near: MemoryModel | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Least squares over all times: amplitudes by linear algebra, the few rates by Levenberg-Marquardt (variable projection).
 
@@ -209,6 +211,7 @@ def fit_memory(
         order: number of exponentials (at least 1) and of pairs.
         starts: starts of the search.
         progress: called with 1 after every start.
+        near: a model of the same order of similar data: the search starts at its rates, and nowhere else.
 
     Returns:
         Tensors for :class:`MemoryModel` but the rates, and a report: converged, root mean square misfit.
@@ -225,9 +228,13 @@ def fit_memory(
     generator = np.random.Generator(np.random.Philox(key=np.array([single, pairs], dtype=np.uint64)))
     lower = np.log(np.concatenate([np.full(single + pairs, SLOWEST), np.full(pairs, 1e-2)]))
     best: Any = None
-    for _ in range(starts):
+    for _ in range(starts if near is None else 1):
         g = np.exp(generator.uniform(np.log(max(SLOWEST * 2, 1 / end)), np.log(1.5), single + pairs))
         w = np.exp(generator.uniform(np.log(0.03), np.log(1.0), pairs))
+        if near is not None:
+            inner = np.log([SLOWEST * 1.01, FASTEST / 1.01])
+            g = np.exp(np.clip(torch.cat([near.decay, near.pair_decay]).log().numpy(), *inner))
+            w = np.exp(np.clip(near.pair_frequency.log().numpy(), np.log(1.01e-2), inner[1]))
         found = optimize.least_squares(
             lambda p: small.amplitudes(small.functions(p, order), order)[1].ravel(),
             np.log(np.concatenate([g, w])),
@@ -243,10 +250,15 @@ def fit_memory(
         if progress is not None:
             progress(1)
     amplitudes, misfit, _ = full.amplitudes(full.functions(best.x, order), order)
+    amplitudes = amplitudes.reshape(-1, n, n)
+    if (
+        float((mean.sum(-1) - basis.sum(-1)[:, None]).abs().max()) < 1e-9
+    ):  # rounding in the data, times large amplitudes
+        amplitudes = amplitudes - amplitudes.mean(-1, keepdims=True)
     g, w = np.exp(best.x[: single + pairs]), np.exp(best.x[single + pairs :])
     tensors = {
         "basis": basis,
-        "amplitudes": torch.from_numpy(amplitudes.reshape(-1, n, n)),
+        "amplitudes": torch.from_numpy(amplitudes),
         "decay": torch.from_numpy(g[:single].copy()),
         "pair_decay": torch.from_numpy(g[single:].copy()),
         "pair_frequency": torch.from_numpy(w.copy()),

@@ -156,24 +156,124 @@ class RateModel(TransferModel):
         return resting + flows(initial - initial @ self.basis, flow, times)
 
 
+class SwingInModel(RateModel):
+    """A :class:`RateModel` whose rates act on energy only some time after it came: the swing-in of Section 3.5.
+
+    Energy starts at rest, is released with the rate 1 / tau, and moves with the rates Q from then on: transfer begins
+    with t^2 rather than t, and late energies are those of a :class:`RateModel` a time tau earlier, which is the t0 of
+    the linear procedure. A chain of two states per band is still Markovian, conserves energy where Q does, and is
+    never negative where no rate between bands is. (In a generalized master equation, whose kernel here is not a
+    delta function; Nakajima 1958, Zwanzig 1960.)
+
+    Args:
+        rates, basis, damping: see :class:`RateModel`.
+        delay: tau, the mean time at rest, per source or one for all.
+    """
+
+    kind = "swing_in"
+
+    def __init__(self, rates: Tensor, basis: Tensor, delay: Tensor, damping: Tensor | None = None) -> None:
+        super().__init__(rates, basis, damping)
+        delay = checks.real_tensor("delay", delay).to(self.rates)
+        if delay.ndim > 1 or delay.numel() not in (1, self.n_bands):
+            raise checks.fail("delay", f"be a number or have shape ({self.n_bands},)", f"shape {tuple(delay.shape)}")
+        checks.first_bad("delay", "be positive", delay, delay <= 0, "band")
+        self.register_buffer("delay", delay.detach().clone().reshape(-1).expand(self.n_bands).contiguous())
+        self.delay: Tensor
+
+    @property
+    def n_parameters(self) -> int:
+        return super().n_parameters + len(self.delay.unique())
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {**super().tensors(), "delay": self.delay}
+
+    def embedding(self) -> Embedding:
+        """Resting, moving and basis energy side by side."""
+        eye = torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device)
+        drain = torch.diag(self.damping)
+        return Embedding(
+            torch.cat([eye - self.basis, torch.zeros_like(eye), self.basis], dim=1),
+            torch.block_diag(swing_in_generator(self.rates, self.delay) - torch.block_diag(drain, drain), -drain),
+            torch.cat([eye, eye, eye]),
+        )
+
+    def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
+        return propagate_embedded(self.embedding(), initial, times)
+
+
+def swing_in_generator(rates: Tensor, delay: Tensor) -> Tensor:
+    """Resting energy is released into moving energy, which moves with the rates, (2 band, 2 band)."""
+    release = torch.diag((1 / delay).expand(len(rates)))
+    return torch.cat([torch.cat([-release, release], dim=1), torch.cat([torch.zeros_like(rates), rates], dim=1)], dim=0)
+
+
+def propagate_embedded(parts: Embedding, initial: Tensor, times: Tensor, supply: Tensor | None = None) -> Tensor:
+    """e(t) of an embedded model by the matrix exponential, (*batch, time, band).
+
+    Args:
+        parts: the model.
+        initial: (*batch, band).
+        times: (time,).
+        supply: energy fed in per unit time, constant between times, (*batch, time, band): the rate up to each time from
+            the one before it (from 0 for the first). With y the state and p the supply, (y, p) obeys one more
+            linear equation, whose exponential is exact.
+    """
+    state = initial @ parts.start
+    if supply is None:
+        return flows(state, parts.generator, times) @ parts.readout
+    size, bands = parts.generator.shape[0], initial.shape[-1]
+    fed = torch.zeros(size + bands, size + bands, dtype=parts.generator.dtype, device=parts.generator.device)
+    fed[:size, :size], fed[size:, :size] = parts.generator, parts.start
+    outputs, before, power, length = [], 0.0, fed, -1.0
+    for i, t in enumerate(times.tolist()):
+        if abs(t - before - length) > 1e-12 * max(t, 1e-300):
+            length = t - before
+            power = torch.linalg.matrix_exp(fed * length)
+        now = supply[..., i, :]
+        joined = torch.cat([state.expand(*now.shape[:-1], size), now], dim=-1)
+        state = (joined @ power)[..., :size]
+        outputs.append(state @ parts.readout)
+        before = t
+    return torch.stack(outputs, dim=-2)
+
+
 def flows(start: Tensor, generator: Tensor, times: Tensor) -> Tensor:
     """start exp(generator t) at each time, (*batch, time, state), from start (*batch, state).
 
-    On a regular grid one matrix exponential, its squares, and products that double the number of times each;
-    else one exponential per time.
+    The times are cut into stretches of equal steps. In each, one matrix exponential, its squares, and products that
+    double the number of times each.
+
+    Raises:
+        FieldError: for a time at which rounding has blurred the rates.
     """
     latest = LONGEST_FLOW / max(float(generator.detach().abs().sum(-1).max()), 1e-300)
     if float(times[-1]) > latest:
         raise checks.fail("times", f"be at most {latest:.3g}, where rounding blurs these rates", float(times[-1]))
-    count = len(times)
-    step = (times[-1] - times[0]) / max(1, count - 1)
-    regular = times[0] + step * torch.arange(count, dtype=times.dtype, device=times.device)
-    if count < 3 or bool((times - regular).abs().max() > 1e-12 * times[-1]):
-        return torch.einsum("...s,tsr->...tr", start, torch.linalg.matrix_exp(generator * times[:, None, None]))
     if float(times[0]) > 0:
         start = start @ torch.linalg.matrix_exp(generator * times[0])
-    path, power = start[..., None, :], torch.linalg.matrix_exp(generator * step)
-    while path.shape[-2] < count:
-        path = torch.cat([path, path[..., : count - path.shape[-2], :] @ power], dim=-2)
-        power = power @ power
-    return path
+    paths = [start[..., None, :]]
+    for step, count in equal_steps(times):
+        path, power = paths[-1][..., -1:, :], torch.linalg.matrix_exp(generator * step)
+        while path.shape[-2] <= count:
+            path = torch.cat([path, path[..., : count + 1 - path.shape[-2], :] @ power], dim=-2)
+            power = power @ power
+        paths.append(path[..., 1:, :])
+    return torch.cat(paths, dim=-2)
+
+
+def equal_steps(times: Tensor) -> list[tuple[float, int]]:
+    """The steps between times as stretches of equal ones: (step, how many)."""
+    stretches: list[tuple[float, int]] = []
+    ticks = times.tolist()
+    begin = 0
+    while begin < len(ticks) - 1:
+        step, end = ticks[begin + 1] - ticks[begin], begin + 1
+        while end + 1 < len(ticks):
+            foreseen = ticks[begin] + step * (end + 1 - begin)
+            if abs(foreseen - ticks[end + 1]) > 1e-12 * ticks[end + 1]:
+                break
+            end += 1
+        stretches.append(((ticks[end] - ticks[begin]) / (end - begin), end - begin))
+        begin = end
+    return stretches

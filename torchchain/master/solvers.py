@@ -12,7 +12,7 @@ import torchdiffeq
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.master.model import TransferModel
+from torchchain.master.model import TransferModel, propagate_embedded
 
 ADAPTIVE = ("dopri8", "dopri5", "bosh3", "fehlberg2", "adaptive_heun")
 FIXED = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams", "fixed_adams")
@@ -44,7 +44,8 @@ class IntegrationError(RuntimeError):
 class Solver:
     """One way to solve the master equation.
 
-    ``run(model, initial, times, **options)`` takes initial (*batch, band) and returns (*batch, time, band).
+    ``run(model, initial, times, supply, **options)`` takes initial (*batch, band), supply (*batch, time, band) or
+    None (see ``propagate_embedded``), and returns (*batch, time, band).
     """
 
     name: str
@@ -53,9 +54,11 @@ class Solver:
     options: tuple[str, ...] = ()
 
 
-def expm(model: TransferModel, initial: Tensor, times: Tensor) -> Tensor:
+def expm(model: TransferModel, initial: Tensor, times: Tensor, supply: Tensor | None = None) -> Tensor:
     """The matrix exponential: exact at every time."""
-    return model.propagate(initial, times)
+    if supply is None:
+        return model.propagate(initial, times)
+    return propagate_embedded(model.embedding(), initial, times, supply)
 
 
 def largest_over_members(error: Tensor) -> Tensor:
@@ -71,41 +74,55 @@ def _ode(method: str) -> Callable[..., Tensor]:
         model: TransferModel,
         initial: Tensor,
         times: Tensor,
-        rtol: float = 1e-8 if fine else 1e-6,
+        supply: Tensor | None = None,
+        rtol: float | None = None,
         atol: float = 1e-10 if fine else 1e-8,
         step: float | None = None,
         solver: str = "LSODA",
     ) -> Tensor:
         parts = model.embedding()
         start = initial @ parts.start
-
-        def slope(t: Tensor, y: Tensor) -> Tensor:
-            return y @ parts.generator
-
-        rtol = checks.number("rtol", rtol, above=0, below=1)
+        # A tolerance below rounding is never met: steps shrink until rounding, which grows with them, is all there is.
+        eps = torch.finfo(parts.generator.dtype).eps
+        default = max(1e-8 if fine else 1e-6, 16 * eps)
+        rtol = default if rtol is None else checks.number("rtol", rtol, at_least=4 * eps, below=1)
         atol = checks.number("atol", atol, above=0)
         span = times if float(times[0]) == 0.0 else torch.cat([times.new_zeros(1), times])
         options: dict[str, Any]
         if scipy:
             options = {"solver": checks.choice("solver", solver, ("RK45", "RK23", "DOP853", "Radau", "BDF", "LSODA"))}
         elif adaptive:  # steps end at the output times: between them the solution is known to a lower order only
-            options = {"norm": largest_over_members, "max_num_steps": MOST_STEPS, "step_t": span}
+            options = {"norm": largest_over_members, "max_num_steps": MOST_STEPS}
         else:
             options = {"step_size": _checked_step(method, parts.generator, step, float(times[-1]))}
             if method.endswith("adams"):
                 options |= {"max_order": ADAMS_STEPS, "max_iters": ADAMS_ITERATIONS}
-        if len(span) == 1:  # only time 0 is asked for
-            path = start[None]
-        else:
-            try:
-                with warnings.catch_warnings():
-                    warnings.filterwarnings("error", message=".*[Ff]unctional iteration did not converge.*")
-                    path = torchdiffeq.odeint(slope, start, span, rtol=rtol, atol=atol, method=method, options=options)
-            except (AssertionError, UserWarning) as error:
-                raise IntegrationError(
-                    f"solver '{method}' must reach time {float(times[-1]):g} with rtol {rtol:g} and atol {atol:g} "
-                    f"in {start.dtype}, got: {error}"
-                ) from None
+
+        def integrate(y: Tensor, span: Tensor, inflow: Tensor | float) -> Tensor:
+            def slope(t: Tensor, y: Tensor) -> Tensor:
+                return y @ parts.generator + inflow
+
+            stops = {"step_t": span} if adaptive else {}
+            return torchdiffeq.odeint(slope, y, span, rtol=rtol, atol=atol, method=method, options=options | stops)
+
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("error", message=".*[Ff]unctional iteration did not converge.*")
+                if len(span) == 1:  # only time 0 is asked for
+                    path = start[None]
+                elif supply is None:
+                    path = integrate(start, span, 0.0)
+                else:  # the supply jumps at the output times
+                    fed = supply[..., -(len(span) - 1) :, :] @ parts.start
+                    states = [start.expand(torch.broadcast_shapes(start.shape, fed[..., 0, :].shape))]
+                    for i in range(len(span) - 1):
+                        states.append(integrate(states[-1], span[i : i + 2], fed[..., i, :])[-1])
+                    path = torch.stack(states)
+        except (AssertionError, UserWarning) as error:
+            raise IntegrationError(
+                f"solver '{method}' must reach time {float(times[-1]):g} with rtol {rtol:g} and atol {atol:g} "
+                f"in {start.dtype}, got: {error}"
+            ) from None
         return torch.movedim(path[-len(times) :] @ parts.readout, 0, -2)
 
     return run

@@ -70,6 +70,7 @@ def energy_moments(chain: Chain, state: State, times: Any, definition: str = "si
     from torchchain.evolvers import stencil
 
     kind = stencil.SITE_MOMENTS if definition == "site" else stencil.BOND_MOMENTS
+    advance.check_work(times)
     march, steps = stencil.March(advance.rows, mirrored=True), times.double().numpy()
     out = np.empty((advance.rows.count, len(steps), 3))
     stencil.share(lambda begin, end: march.moments(begin, end, steps, kind, out), advance.rows.count)
@@ -120,6 +121,7 @@ def band_energy(
         )
     from torchchain.evolvers import stencil
 
+    advance.check_work(times)
     n, steps, rows = chain.n_particles, times.double().numpy(), advance.rows
     kind, count = stencil.BOND_FIELDS, 2
     strain = np.zeros(n // 2 + 1)

@@ -1,0 +1,203 @@
+"""One artifact for a range of disorder: models calibrated at several strengths, and any strength between."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.ensemble import BandTransfer
+from torchchain.master import artifact
+from torchchain.master.calibration import calibrate
+from torchchain.master.equation import Calibration, MasterEquation
+from torchchain.master.memory import MemoryModel
+from torchchain.master.trust import Uncertainty
+from torchchain.statistics import total_variation
+
+NEIGHBORS = 4
+
+
+class MasterFamily:
+    """Master equations of the same bands and chains for several strengths xi of the disorder.
+
+    At a strength between them the transfer is a weighted sum of those of up to four neighbors, with the weights of
+    Lagrange's polynomial in log xi, at every time. They add up to 1, so that energy is conserved as exactly as
+    by the members, and at time 0 every band has its own energy. Below the lowest strength the other neighbor is the chain
+    without disorder, in which nothing moves, with the weight 1 - (xi / lowest)^2: to leading order what weak disorder
+    moves is proportional to xi^2 at every time, and it vanishes with xi.
+
+    Args:
+        members: models with memory, of different strengths.
+
+    Raises:
+        FieldError: if they differ in more than the strength of the disorder.
+    """
+
+    def __init__(self, members: Sequence[MasterEquation]) -> None:
+        if not members:
+            raise checks.fail("members", "be at least one master equation", 0)
+        self.members = tuple(sorted(members, key=lambda member: member.calibration.scene.disorder.strength))
+        first = self.members[0].calibration.scene
+        for member in self.members:
+            scene = member.calibration.scene
+            if not isinstance(member.model, MemoryModel):
+                raise checks.fail("members", "have the model 'memory'", repr(member.calibration.model))
+            for name in ("n_particles", "n_bands", "boundary", "contact", "damping", "stiffness_disorder"):
+                if getattr(scene, name) != getattr(first, name):
+                    raise checks.fail(
+                        "members", f"have the same {name}", f"{getattr(first, name)} and {getattr(scene, name)}"
+                    )
+            if replace(scene.disorder, strength=first.disorder.strength) != first.disorder:
+                raise checks.fail("members", "differ in the strength of their disorder only", f"{scene.disorder}")
+        found = self.strengths
+        if any(b <= a for a, b in pairwise(found)) or found[0] == 0:
+            raise checks.fail("members", "have different strengths above 0", list(found))
+
+    @property
+    def strengths(self) -> tuple[float, ...]:
+        """xi of the members, increasing."""
+        return tuple(member.calibration.scene.disorder.strength for member in self.members)
+
+    def weights(self, strength: float) -> dict[float, float]:
+        """Weight of every member, by its strength, and of the chain without disorder, 0.0, at a strength."""
+        strength = checks.number("strength", strength, at_least=0)
+        known = self.strengths
+        if strength > known[-1] * (1 + 1e-12):
+            raise checks.fail("strength", f"be at most {known[-1]:g}, the largest calibrated", strength)
+        strength = min(strength, known[-1])
+        if strength in known:
+            return {strength: 1.0}
+        if strength < known[0]:
+            share = (strength / known[0]) ** 2
+            return {0.0: 1 - share, known[0]: share}
+        place = next(i for i, other in enumerate(known) if other > strength)
+        begin = max(0, min(place - NEIGHBORS // 2, len(known) - NEIGHBORS))
+        near = known[begin : begin + NEIGHBORS]
+        return {
+            a: math.prod(math.log(strength / b) / math.log(a / b) for b in near if b != a)
+            for a in near
+        }  # fmt: skip
+
+    def at(self, strength: float) -> MasterEquation:
+        """The master equation at a strength from 0 to the largest calibrated.
+
+        Raises:
+            FieldError: for a larger one.
+        """
+        weights = self.weights(strength)
+        chosen = {m.calibration.scene.disorder.strength: m for m in self.members}
+        if list(weights.values()) == [1.0] and next(iter(weights)) in chosen:
+            return chosen[next(iter(weights))]
+        parts = [(w, chosen[xi]) for xi, w in weights.items() if xi in chosen]
+        scene = parts[0][1].calibration.scene
+        scene = replace(scene, disorder=replace(scene.disorder, strength=float(strength)))
+        limits = [member.horizon for _, member in parts]
+        report: dict[str, Any] = {
+            "interpolated": [[xi, weight] for xi, weight in weights.items()],
+            "horizon": min(limits) if math.isfinite(min(limits)) else "infinite",
+        }
+        damping = [
+            torch.as_tensor(m.calibration.report["damping"]) * w for w, m in parts if "damping" in m.calibration.report
+        ]
+        if damping:
+            report["damping"] = torch.stack(damping).sum(0).tolist()
+        record = Calibration("projection", "memory", parts[0][1].calibration.window, scene, report)
+        return MasterEquation(_combined(parts, weights.get(0.0, 0.0)), record, _combined_errors(parts))
+
+    def solve(self, initial: Any, times: Any, strength: float, method: str = "expm", **options: Any) -> Tensor:
+        """Band energies at a strength; see :meth:`MasterEquation.solve`."""
+        return self.at(strength).solve(initial, times, method, **options)
+
+    def leave_one_out(self, times: Any) -> list[tuple[float, float]]:
+        """What interpolation costs: each inner member's strength, and its total variation from the others' prediction.
+
+        Args:
+            times: at which they are compared, (time,); the mean is over these and all sources.
+        """
+        times = checks.times("times", times)
+        found = []
+        for i in range(1, len(self.members) - 1):
+            member = self.members[i]
+            others = MasterFamily([*self.members[:i], *self.members[i + 1 :]])
+            strength = member.calibration.scene.disorder.strength
+            there = others.at(strength).model.transfer(times)
+            found.append((strength, float(total_variation(there, member.model.transfer(times)).mean())))
+        return found
+
+    def save(self, path: str | Path) -> None:
+        """Write all members to one safetensors file, all or nothing."""
+        artifact.save_family([(m.model, m.calibration.__dict__, m.uncertainty) for m in self.members], path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> MasterFamily:
+        """Read a saved family; every field is checked.
+
+        Raises:
+            FieldError: naming the file and what is wrong with it.
+        """
+        members = artifact.load_family(path)
+        return cls([MasterEquation(model, Calibration(**record), errors) for model, record, errors in members])
+
+
+def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> MasterFamily:
+    """Calibrate a model with memory on each transfer and join them.
+
+    Args:
+        transfers: of ensembles that differ in the strength of their disorder (and in seeds, realizations and times).
+        settings: of :func:`torchchain.calibrate`, but method and model.
+    """
+    return MasterFamily([calibrate(transfer, "projection", "memory", **settings) for transfer in transfers])
+
+
+def _combined(parts: Sequence[tuple[float, MasterEquation]], idle: float) -> MemoryModel:
+    """The weighted sum of models with memory, and of the chain in which nothing moves with the weight ``idle``."""
+    models = [(weight, member.model) for weight, member in parts]
+    single, paired = [], []
+    for weight, model in models:
+        assert isinstance(model, MemoryModel), "the constructor has checked it"
+        count = len(model.decay)
+        single.append(weight * model.amplitudes[:count])
+        paired.append(weight * model.amplitudes[count:])
+
+    def joined(name: str) -> Tensor:
+        return torch.cat([getattr(model, name) for _, model in models])
+
+    def summed(name: str) -> Tensor:
+        return torch.stack([weight * getattr(model, name) for weight, model in models]).sum(0)
+
+    basis = summed("basis")
+    return MemoryModel(
+        rates=summed("rates").detach(),
+        basis=basis + idle * torch.eye(len(basis), dtype=basis.dtype),
+        amplitudes=torch.cat([*single, *paired]),
+        decay=joined("decay"),
+        pair_decay=joined("pair_decay"),
+        pair_frequency=joined("pair_frequency"),
+        damping=None,
+    )
+
+
+def _combined_errors(parts: Sequence[tuple[float, MasterEquation]]) -> Uncertainty | None:
+    """Errors of the weighted sum, those of different members being independent."""
+    held = [(weight, member.uncertainty) for weight, member in parts if member.uncertainty is not None]
+    if len(held) < len(parts):
+        return None
+    times = held[0][1].times
+    eye = torch.eye(len(held[0][1].rates_stderr), dtype=times.dtype)
+
+    def joined(values: list[Tensor]) -> Tensor:
+        return torch.stack([(w * v).square() for (w, _), v in zip(held, values, strict=True)]).sum(0).sqrt()
+
+    return Uncertainty(
+        joined([errors.rates_stderr for _, errors in held]),
+        joined([errors.basis_stderr for _, errors in held]),
+        times,
+        joined([errors.of(eye, times) for _, errors in held]),
+    )

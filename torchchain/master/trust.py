@@ -1,0 +1,168 @@
+"""How far a calibrated model can be trusted: error bars by block bootstrap, and the horizon of its predictions.
+
+The error of a predicted energy has two parts. The ensemble is finite: blocks of realizations are drawn again with
+replacement and the model is fitted again (Efron 1979; Kunsch 1989). And the model is not the chain: where it misses
+its own ensemble by more than the ensemble's error explains, the rest, smoothed over neighboring times and bands, is
+counted as the model's own error.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.ensemble import BandTransfer
+from torchchain.master.fits import FitWarning
+from torchchain.master.ladder import Recipe, Sample, fit
+from torchchain.master.model import TransferModel
+from torchchain.statistics import statistical_distance, total_variation
+
+MOST_TIMES = 64
+"""Times at which the errors of predictions are kept."""
+SMOOTHING = 2
+"""Neighbors on either side, in time and in receiving band, over which the model's own error is averaged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Standard errors of a calibration and of what it predicts.
+
+    Attributes:
+        rates_stderr, basis_stderr: of Q and Pi, [source, receiver].
+        times: (time,), some of the calibration's, increasing.
+        stderr: of the predicted share of the energy, [source, time, receiver].
+    """
+
+    rates_stderr: Tensor
+    basis_stderr: Tensor
+    times: Tensor
+    stderr: Tensor
+
+    def of(self, initial: Tensor, times: Tensor) -> Tensor:
+        """Standard error of the prediction from a start, (*batch, time, band).
+
+        The errors of different sources are taken as independent; between the kept times they are interpolated, and
+        beyond the last they stay.
+
+        Args:
+            initial: (*batch, band).
+            times: (time,).
+        """
+        kept, stderr = self.times.to(initial), self.stderr.to(initial)
+        after = torch.searchsorted(kept, times.contiguous()).clamp(1, len(kept) - 1)
+        low, high = kept[after - 1], kept[after]
+        weight = ((times - low) / (high - low)).clamp(0, 1)[:, None]
+        here = stderr[:, after - 1] * (1 - weight) + stderr[:, after] * weight
+        return torch.einsum("...s,str->...tr", initial.square(), here.square()).sqrt()
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {
+            "rates_stderr": self.rates_stderr, "basis_stderr": self.basis_stderr,
+            "stderr_times": self.times, "stderr": self.stderr,
+        }  # fmt: skip
+
+    @classmethod
+    def from_tensors(
+        cls, rates_stderr: Tensor, basis_stderr: Tensor, stderr_times: Tensor, stderr: Tensor
+    ) -> Uncertainty:
+        """The inverse of :meth:`tensors`, checked."""
+        n, count = len(rates_stderr), len(stderr_times)
+        values = {
+            "rates_stderr": rates_stderr,
+            "basis_stderr": basis_stderr,
+            "stderr_times": stderr_times,
+            "stderr": stderr,
+        }
+        shapes = {"rates_stderr": (n, n), "basis_stderr": (n, n), "stderr_times": (count,), "stderr": (n, count, n)}
+        for name, value in values.items():
+            checks.real_tensor(name, value)
+            if tuple(value.shape) != shapes[name]:
+                raise checks.fail(name, f"have shape {shapes[name]}", f"shape {tuple(value.shape)}")
+            checks.first_bad(name, "not be negative", value, value < 0)
+        if count < 2 or not bool((stderr_times.diff() > 0).all()):
+            raise checks.fail("stderr_times", "be at least two increasing times", f"{count} times")
+        return cls(rates_stderr, basis_stderr, stderr_times, stderr)
+
+
+def bootstrap(
+    transfer: BandTransfer,
+    recipe: Recipe,
+    model: TransferModel,
+    replicates: int,
+    progress: Callable[[int], Any] | None = None,
+) -> Uncertainty:
+    """Fit the same recipe to ``replicates`` ensembles of blocks drawn with replacement.
+
+    Deterministic: the draws depend on the numbers of blocks and replicates alone.
+
+    Args:
+        transfer: what the model was fitted to, of at least two blocks.
+        recipe: with model, method and order.
+        model: fitted to the whole transfer.
+        replicates: how many, at least 2.
+        progress: called with 1 after every replicate.
+    """
+    blocks = len(transfer.block_counts)
+    draws = np.random.Generator(np.random.Philox(key=np.array([blocks, replicates], dtype=np.uint64)))
+    kept = _kept(len(transfer.times))
+    times = transfer.times[kept]
+    rates, bases, paths = [], [], []
+    for _ in range(replicates):
+        repeats = np.bincount(draws.integers(0, blocks, blocks), minlength=blocks)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FitWarning)
+            other, _ = fit(Sample.of_blocks(transfer, torch.from_numpy(repeats)), recipe, near=model)
+        rates.append(other.rates.detach())
+        bases.append(other.basis)
+        paths.append(other.transfer(times).detach())
+        if progress is not None:
+            progress(1)
+    # blocks drawn with replacement spread (blocks - 1) / blocks of what independent ensembles do
+    scale = math.sqrt(blocks / (blocks - 1))
+    spread = scale * torch.stack(paths).std(0)
+    missed = (model.transfer(transfer.times).detach() - transfer.mean).square()
+    noise = torch.zeros_like(missed)
+    noise[:, kept] = (transfer.stderr[:, kept].square() - spread.square()).clamp(min=0)
+    own = _smooth((missed - noise)[:, kept]).clamp(min=0)
+    return Uncertainty(
+        scale * torch.stack(rates).std(0), scale * torch.stack(bases).std(0), times, (spread.square() + own).sqrt()
+    )
+
+
+def _kept(count: int) -> Tensor:
+    """Indices of at most MOST_TIMES of the times, first and last among them."""
+    return torch.linspace(0, count - 1, min(count, MOST_TIMES), dtype=torch.float64).round().long().unique()
+
+
+def _smooth(values: Tensor) -> Tensor:
+    """Moving average over times and receivers, [source, time, receiver]; windows are cut at the edges."""
+    width = 2 * SMOOTHING + 1
+    return torch.nn.functional.avg_pool2d(values[:, None], width, stride=1, padding=SMOOTHING, count_include_pad=False)[
+        :, 0
+    ]
+
+
+def horizon(transfer: BandTransfer, model: TransferModel) -> float:
+    """The time up to which predictions were compared with chains.
+
+    That is the last time of the calibration, or infinity where the chains have settled by then, in the last quarter of
+    the times, to their exact long-time average, and the model goes to the same: both within twice the distance
+    of two such ensembles.
+    """
+    end = float(transfer.times[-1])
+    if transfer.long_time is None or end == 0 or transfer.scene.damping > 0:
+        return end
+    late = transfer.times > 0.75 * end
+    noise = 2 * float(statistical_distance(transfer.stderr[:, late]).mean())
+    settled = float(total_variation(transfer.mean[:, late], transfer.long_time[:, None]).mean())
+    latest = torch.tensor([end, 100 * end], dtype=transfer.times.dtype)
+    ahead = float(total_variation(model.transfer(latest)[:, -1].detach(), transfer.long_time).mean())
+    return math.inf if settled <= noise and ahead <= noise else end
