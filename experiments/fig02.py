@@ -146,8 +146,8 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         if xi == 0:
             ax.plot([], [], "k--", lw=0.8, label="group velocities")
         ax.set(xlabel="particle p", ylabel="mean energy / energy of the kick", yscale="log", title=f"$\\xi$ = {xi:g}")
-        ax.set(xlim=(-0.02 * config.n_particles, config.n_particles), ylim=(1e-6, 2 * float(data.energy.max())))
-        ax.legend(fontsize="small", loc="upper right")
+        ax.set(xlim=(-0.02 * config.n_particles, config.n_particles), ylim=(1e-6, 10 * float(data.energy.max())))
+        ax.legend(fontsize="small", loc="upper center", ncols=len(config.times) // 2 + 1)
     figure.suptitle(
         f"kick at particle {config.site}, {config.realizations} chains, shaded: standard error; triangles: the coherent front",
         fontsize="medium",

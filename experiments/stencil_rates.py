@@ -207,10 +207,13 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         left.plot(data.particles, rate.median("repeat"), "o-", label=kind)
         left.fill_between(data.particles, rate.min("repeat"), rate.max("repeat"), alpha=0.2)
     left.set(xscale="log", yscale="log", xlabel="particles N", ylabel="$10^9$ stencil updates / s, one core")
+    left.set_xticks(data.particles.values, [str(n) for n in data.particles.values])
+    left.set_xticks([], minor=True)
     left.legend()
     medians = data.impulse.median("repeat") * 1e3
-    bars = right.bar(data.way.values, medians)
+    bars = right.bar(["compiled kernels", "modes"], [medians.sel(way=way) for way in ("kernels", "modes")])
     right.bar_label(bars, fmt="%.3g")
+    right.margins(y=0.1)  # room for the numbers
     right.set(
         yscale="log",
         ylabel="ms per chain, all cores",

@@ -37,6 +37,8 @@ def reference(scene, i):
             center = (particle * energy).sum() / energy.sum()
             rows["displacement"].append(u)
             rows["energy"].append(energy)
+            rows["dissipated"].append(0.0)  # linear contacts without damping: nothing is lost, none is open
+            rows["openings"].append(0.0)
             rows["source_energy"].append(energy[getattr(scene.excitation, "site", 1) - 1])
             rows["total_energy"].append(energy.sum())
             rows["center"].append(center)

@@ -168,6 +168,24 @@ def test_slope_of_the_contact_law_where_contacts_open(elongation):
     assert slope.tolist() == pytest.approx([max(1 - elongation, 0.0) ** 0.5] * 2, abs=1e-8)
 
 
+def test_an_ensemble_reports_openings_and_the_energy_balance():
+    """What an ensemble keeps and loses stays what the kick gave, while contacts open and damp."""
+    observables = ("total_energy", "dissipated", "openings")
+    scene = tc.Scene(
+        n_particles=16, boundary="fixed", contact="hertz", damping=0.05, energy_definition="bond", realizations=3,
+        excitation=tc.Impulse(4, 2.0), times=torch.linspace(0, 20, 5, dtype=torch.float64), observables=observables,
+    )  # fmt: skip
+    data = tc.simulate(scene, "verlet")
+    balance = (data.total_energy + data.dissipated).values
+    assert balance == pytest.approx(np.full(5, balance[0]), rel=1e-2)
+    assert data.dissipated.values[-1] > 0.2 * balance[0]
+    chain = tc.Chain(scene.disorder.masses(16, 3, scene.seed), "fixed", contact="hertz", damping=0.05)
+    alone = tc.evolve(chain, tc.impulse(chain, 4, 2.0), scene.times, "verlet")
+    assert data.openings.values.tolist() == alone.openings.double().mean(0).tolist()
+    assert data.openings.values[-1] > 0
+    assert data.dissipated.values == pytest.approx(alone.dissipated.mean(0).numpy(), rel=1e-12)
+
+
 # --- the guard -------------------------------------------------------------------------------------------------
 
 

@@ -152,7 +152,7 @@ class Checkpoint:
                     name,
                     f"stay {checks.shown(before.get(name))} as in the unfinished run in {self.folder} "
                     "(remove that folder to begin anew)",
-                    now.get(name),
+                    checks.shown(now.get(name)),
                 )
 
     def _merge(

@@ -87,7 +87,7 @@ class SceneFlags:
     observables: tuple[str, ...] | None = None
     """what to measure (default band_energy)"""
     contact: str | None = None
-    """linear (default) or hertz"""
+    """linear (default), hertz, or auto for linear where that is accurate enough"""
     damping: float | None = None
     """contact damping coefficient (default 0)"""
     energy_definition: str | None = None
@@ -99,7 +99,7 @@ class SceneFlags:
             self,
             skip=(
                 "config", "out", "device", "method", "fit", "model", "window", "constraint", "penalty",
-                "checkpoint_every", "threads",
+                "checkpoint_every", "threads", "artifact",
             ),
         )  # fmt: skip
 
@@ -181,6 +181,9 @@ class Predict:
 @dataclass(frozen=True)
 class Plan(SceneFlags):
     """The cheapest way to meet a scene, with reasons and runners-up."""
+
+    artifact: str | None = None
+    """a model file of calibrate that could take the place of the chains"""
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def run(flags: Any, arguments: list[str]) -> int:
     elif isinstance(flags, Predict):
         run_predict(flags, arguments)
     elif isinstance(flags, Plan):
-        print(planning.plan(_scene(flags)[0]))
+        print(planning.plan(_scene(flags)[0], artifact=flags.artifact))
     return 0
 
 
@@ -113,7 +114,7 @@ def run_simulate(
         keep: whether to keep a checkpoint in the folder until it is done.
     """
     began = time.time()
-    scene, _ = _scene(flags)
+    scene = planning.resolved(_scene(flags)[0])
     out = outputs.check_writable(flags.out)
     device = str(checks.device("device", ranks.own_device(flags.device)))
     checks.choice("method", flags.method, ("auto", *METHODS))
@@ -128,12 +129,15 @@ def _simulate(
 ) -> None:  # fmt: skip
     stages = Stages()
     with ranks.process_group(device) as group:
+        before = time.time()
         data = simulate(
             scene, flags.method, device=device, progress=True, stages=stages, options=options, checkpoint=checkpoint,
             ranks=group,
         )  # fmt: skip
+        spent = time.time() - before
     if group.rank:
         return
+    forecast = planning.forecast(scene, data.attrs, spent, _largest_error(data, scene.observables))
     figure = _simulate_figure(scene, data)
     config = scene.to_toml()
     outputs.write(
@@ -143,7 +147,7 @@ def _simulate(
             "results.nc": outputs.dataset(data),
             "figure.png": outputs.figure(figure),
             "run.json": outputs.run_record(
-                arguments, config, device, began, stages.seconds, seed=scene.seed,
+                arguments, config, device, began, stages.seconds, seed=scene.seed, forecast=forecast,
                 **_how(flags, data.attrs, group, checkpoint),
             ),
         },
@@ -151,6 +155,7 @@ def _simulate(
     if checkpoint is not None:
         checkpoint.clear()
     print(describe(scene))
+    print(planning.forecast_line(forecast))
     print(f"masses: mean {data.attrs['mass_mean']:.6f}, standard deviation {data.attrs['mass_sd']:.6f}")
     for name in scene.observables:
         last = data[name].isel(time=-1) if "time" in data[name].dims else data[name]
@@ -159,6 +164,11 @@ def _simulate(
         if last.ndim == 0:
             print(f"{name} at the last time: {float(last):.6g} +- {float(error):.2g}")
     print(f"{time.time() - began:.1f} s, results in {out}")
+
+
+def _largest_error(data: xarray.Dataset, names: Sequence[str]) -> float:
+    """Largest standard error of the observables, each relative to its own largest value."""
+    return max(float(data[f"{name}_stderr"].max()) / (float(abs(data[name]).max()) or 1.0) for name in names)
 
 
 def _how(
@@ -234,12 +244,16 @@ def _calibrate(
 ) -> None:  # fmt: skip
     stages = Stages()
     with ranks.process_group(device) as group:
+        before = time.time()
         transfer = band_transfer(
             scene, flags.method, device=device, progress=True, stages=stages, options=options, checkpoint=checkpoint,
             ranks=group,
         )  # fmt: skip
+        spent = time.time() - before
     if group.rank:
         return
+    measured = replace(transfer.scene, observables=("band_energy", "long_time_band_energy"))
+    forecast = planning.forecast(measured, transfer.attributes, spent, float(transfer.stderr.max()))
     with stages("calibration"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         master = calibrate(transfer, progress=True, **settings)
@@ -265,13 +279,14 @@ def _calibrate(
                 "figure.png": outputs.figure(figure),
                 "run.json": outputs.run_record(
                     arguments, config, device, began, stages.seconds, seed=scene.seed,
-                    **_how(flags, transfer.attributes, group, checkpoint), summary=dict(rows),
+                    **_how(flags, transfer.attributes, group, checkpoint), forecast=forecast, summary=dict(rows),
                 ),
             },
         )  # fmt: skip
     if checkpoint is not None:
         checkpoint.clear()
     print(describe(transfer.scene))
+    print(planning.forecast_line(forecast))
     for warning in caught:
         print(f"warning: {warning.message}")
     width = max(len(name) for name, _ in rows)

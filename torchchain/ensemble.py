@@ -69,6 +69,15 @@ def _source_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor
     return _energy(scene, chain, trajectory)[..., site - 1]
 
 
+def _dissipated(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+    return torch.zeros_like(trajectory.displacement[..., 0]) if trajectory.dissipated is None else trajectory.dissipated
+
+
+def _openings(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+    none = torch.zeros_like(trajectory.displacement[..., 0])
+    return none if trajectory.openings is None else trajectory.openings.to(none)
+
+
 def _band_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
     """Share of the energy, of that at the start where damping takes some of it."""
     share = band_energy(chain, trajectory, scene.n_bands, scene.damping == 0, scene.energy_definition)
@@ -82,7 +91,9 @@ def _band_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
 ENERGY_UNIT = "contact stiffness * initial overlap^2"
 IN_TIME: dict[str, Observable] = {
     "displacement": Observable(("time", "particle"), "initial overlap", "displacement", lambda s, c, t: t.displacement),
+    "dissipated": Observable(("time",), ENERGY_UNIT, "energy lost to contact damping so far", _dissipated),
     "energy": Observable(("time", "particle"), ENERGY_UNIT, "energy per particle", _energy),
+    "openings": Observable(("time",), "1", "contacts that were open at any step so far", _openings),
     "source_energy": Observable(("time",), ENERGY_UNIT, "energy of the source particle", _source_energy),
     "total_energy": Observable(("time",), ENERGY_UNIT, "total energy", lambda s, c, t: total_energy(c, t)),
     "center": Observable(("time",), "particle", "center of energy R", lambda s, c, t: energy_center(_energy(s, c, t))),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
@@ -27,6 +28,7 @@ class Machine:
         version: of this record.
         cores: threads that torch uses.
         compilation: seconds that the kernels take before their first use; 0 once they are compiled.
+        loading: seconds to load the compiled kernels, once in a process.
         run: what any run takes.
         call: one operation on a small tensor.
         draw: mass of one particle.
@@ -48,6 +50,7 @@ class Machine:
     version: int = VERSION
     cores: int = 2
     compilation: float = 20.0
+    loading: float = 0.5
     run: float = 2.0e-3
     call: float = 3.0e-6
     draw: float = 4.0e-8
@@ -124,6 +127,11 @@ def kernels_compiled() -> bool:
     return any(folder.glob("stencil.*.nbi")) if not own else any(Path(own).glob("**/stencil.*.nbi"))
 
 
+def kernels_loaded() -> bool:
+    """Whether this process has loaded the stencil's kernels."""
+    return "torchchain.evolvers.stencil" in sys.modules
+
+
 def _seconds(work: Callable[[], object], spend: float = 0.05) -> float:
     """The shortest of many short runs after a first: what the work costs where nothing else disturbs it.
 
@@ -147,6 +155,10 @@ def measure() -> Machine:
     with single_thread():
         found = _tensors() | _decompositions()
         if kernels_compiled():
+            fresh, begin = not kernels_loaded(), time.perf_counter()
+            _small_run()
+            if fresh:
+                found["loading"] = time.perf_counter() - begin
             found |= _stencils() | _steppers() | {"compilation": 0.0}
         found |= {"run": _seconds(_small_run)}
     return Machine(VERSION, cores, **found)

@@ -59,6 +59,9 @@ def write(out: str | Path, writers: dict[str, Writer]) -> None:
     out = Path(out)
     with _reported(out):
         out.parent.mkdir(parents=True, exist_ok=True)
+        for beside in list(out.parent.iterdir()):  # what killed runs left
+            if beside.name.startswith(f".{out.name}.") and beside.name.endswith(".part"):
+                shutil.rmtree(beside, ignore_errors=True)
         staging = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
         try:
             for name, writer in writers.items():
@@ -88,9 +91,18 @@ def dataset(data: xarray.Dataset) -> Writer:
     """A writer of a netCDF file."""
 
     def writer(path: Path) -> None:
+        _require_room(path, data.nbytes)
         data.to_netcdf(path, engine="h5netcdf")
 
     return writer
+
+
+def _require_room(path: Path, size: int) -> None:
+    """An OSError if the disk has no room for a file of this size: HDF5 can crash where it runs out of it."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    with open(path, "wb") as file:
+        os.posix_fallocate(file.fileno(), 0, size + 2**16)
 
 
 def figure(drawn: Any) -> Writer:

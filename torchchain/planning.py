@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,14 +14,14 @@ import torch
 from torchchain import checks
 from torchchain.evolvers import METHODS
 from torchchain.machine import Machine, this_machine
-from torchchain.predictions import MOMENTS, Facts, seconds, settle
+from torchchain.predictions import MOMENTS, Facts, error_of, seconds, settle
 from torchchain.scene import Scene
 from torchchain.threads import single_thread
 
 if TYPE_CHECKING:
     from torchchain.master import MasterEquation
 
-__all__ = ["MOMENTS", "Choice", "Plan", "plan", "resolved", "statistical_error"]
+__all__ = ["MOMENTS", "Choice", "Plan", "forecast", "forecast_line", "plan", "resolved", "statistical_error"]
 
 CANDIDATES = ("modes", "tridiagonal", "chebyshev", "verlet", "symplectic4", "damped", "dopri8")
 # Only these keep what they compute in float32: the stencil kernels work in float64 whatever the input, and modes from
@@ -138,7 +140,9 @@ def _plan(scene: Scene, machine: Machine, artifact: str | Path | MasterEquation 
     facts = Facts(scene if scene.contact != "auto" else replace(scene, contact="linear"))
     tolerance, reasons = _tolerance(scene)
     scene, facts, why = _settled(scene, facts, tolerance)
-    usable = [name for name in CANDIDATES if _can(name, scene)]
+    usable = [name for name in CANDIDATES if _can(name, scene) and _fits(name, scene)]
+    if not usable:
+        raise checks.fail("method", "treat the scene's contact, boundary, damping and size", "none")
     precisions = {name: (torch.float64, torch.float32) if name in SINGLE else (torch.float64,) for name in usable}
     choices = [
         _choice(name, facts, tolerance, dtype, machine) for name in usable for dtype in precisions[name]
@@ -163,6 +167,40 @@ def _plan(scene: Scene, machine: Machine, artifact: str | Path | MasterEquation 
         math.ceil(facts.moving(0)) if facts.reach is None else facts.n, tuple(reasons),
         tuple(choice for choice in choices if choice is not best),
     )  # fmt: skip
+
+
+def forecast(scene: Scene, how: Mapping[str, Any], spent: float, statistical: float) -> dict[str, Any]:
+    """What the plan predicts of a run that has been made, beside what was measured, for its record.
+
+    Args:
+        scene: what was run.
+        how: its ``method`` and ``method_options`` (JSON), as results carry them.
+        spent: seconds that it took.
+        statistical: largest standard error of the ensemble, relative to the scale of the observable.
+
+    Returns:
+        predicted_seconds, seconds, predicted_error, statistical_error; no prediction for methods that no plan weighs.
+    """
+    measured = {"seconds": spent, "statistical_error": statistical}
+    if how["method"] not in CANDIDATES:
+        return measured
+    options = json.loads(how["method_options"])
+    dtype = torch.float32 if options.pop("dtype", "") == "float32" else torch.float64
+    with single_thread():
+        facts = Facts(scene)
+        suggested, error = settle(how["method"], facts, _tolerance(scene)[0], dtype)
+        if {**suggested, **options} != suggested:
+            error = error_of(how["method"], facts, {**suggested, **options}, dtype)
+        predicted = seconds(how["method"], facts, {**suggested, **options}, dtype, this_machine())
+    return {"predicted_seconds": predicted, **measured, "predicted_error": error}
+
+
+def forecast_line(record: Mapping[str, Any]) -> str:
+    """The record of :func:`forecast` in words."""
+    words = f"ensemble: {record['seconds']:.2g} s"
+    if "predicted_seconds" in record:
+        words += f" ({record['predicted_seconds']:.2g} s predicted), error of the method {record['predicted_error']:.1e} predicted"
+    return words + f", standard error up to {record['statistical_error']:.1e} of the largest value"
 
 
 def resolved(scene: Scene) -> Scene:
@@ -213,6 +251,17 @@ def _can(name: str, scene: Scene) -> bool:
     return fits and (scene.damping == 0 or entry.damped) and not (name == "damped" and scene.damping == 0)
 
 
+def _fits(name: str, scene: Scene) -> bool:
+    """Whether the memory is enough for one realization."""
+    from torchchain.ensemble import layout
+
+    try:
+        layout(scene, name, scene.observables, torch.device("cpu"))
+    except checks.FieldError:
+        return False
+    return True
+
+
 def _choice(name: str, facts: Facts, tolerance: float, dtype: torch.dtype, machine: Machine) -> Choice:
     options, error = settle(name, facts, tolerance, dtype)
     return Choice(name, options, error, seconds(name, facts, options, dtype, machine), tolerance, dtype)
@@ -233,14 +282,16 @@ def _stand_in(
     missing = coverage.gaps(master, scene)
     if missing:
         return [], [f"the master equation at hand does not cover the scene: {'; '.join(missing)}"]
-    error = coverage.error(master)
+    error = coverage.error(master, scene)
     if error is None:
         return [], ["the master equation at hand covers the scene, but its calibration does not tell its error"]
     allowed = tolerance if scene.tolerance is not None else statistical_error(scene)
     choice = Choice(ARTIFACT, {}, error, coverage.seconds(master, scene), allowed)
     verdict = "accurate enough" if choice.good else "not accurate enough"
-    words = f"the master equation at hand covers the scene and is {verdict}: error {error:.1e} in total variation"
-    return [choice], [f"{words}, {allowed:.1e} allowed"]
+    return [choice], [
+        f"the master equation at hand covers the scene and is {verdict}: its shares of the energy are good to "
+        f"{error:.1e}, {allowed:.1e} allowed"
+    ]
 
 
 def _method_reasons(best: Choice, good: list[Choice], facts: Facts, machine: Machine) -> list[str]:

@@ -13,7 +13,7 @@ from torchchain.chain import Chain
 from torchchain.evolvers.drift import total
 from torchchain.evolvers.linearity import elongation_estimate, force_deviation
 from torchchain.excitation import Impulse, State
-from torchchain.machine import Machine
+from torchchain.machine import Machine, kernels_loaded
 from torchchain.reach import reach
 from torchchain.scene import BAND_OBSERVABLES, Scene
 
@@ -24,8 +24,8 @@ SAMPLE_SIZE = 2**16  # particles in them
 STEPPERS = {"verlet": (2, 1 / 24, 1, 2.0), "symplectic4": (4, 6e-5, 4, 2.98944)}  # order, phase error, forces, limit
 # Elementwise passes over a state that an observable takes where the kernels do not measure it themselves.
 PASSES = {
-    "band_energy": 30, "center": 18, "displacement": 2, "energy": 16, "source_energy": 14, "total_energy": 12,
-    "wavenumber_energy": 30, "width": 22,
+    "band_energy": 30, "center": 18, "displacement": 2, "dissipated": 0, "energy": 16, "openings": 0, "source_energy": 14,
+    "total_energy": 12, "wavenumber_energy": 30, "width": 22,
 }  # fmt: skip
 
 
@@ -60,6 +60,7 @@ class Facts:
         bounds = chain.squared_frequency_bound(sweeps=8).sqrt()
         self.typical, self.limit = float(bounds.mean()), self._limit(scene, float(bounds.max()))
         self._linear, self._state = replace(chain, contact="linear", damping=0.0), state
+        self._frequencies: dict[int, float] = {}
         self.impulse = isinstance(scene.excitation, Impulse)
         later = self.gaps[self.gaps > 0]
         self.uniform = len(later) > 0 and bool((later - later[0]).abs().max() <= 1e-9 * self.end)
@@ -83,6 +84,8 @@ class Facts:
         The shares of the modes never change in a linear chain, so that this is what a phase error in w^power does
         at all times. A wave in Hertz contacts makes harmonics, up to the highest frequency of the ordered chain.
         """
+        if power in self._frequencies:
+            return self._frequencies[power]
         state = self._state
         first = total(self._linear, state.displacement, state.velocity)
         for _ in range(power):
@@ -92,7 +95,18 @@ class Facts:
         if self.scene.contact == "hertz":
             harmonics = min(1.0, self.deviation * self.end * mean ** (1 / power))
             mean = max(mean, harmonics * 2.0**power) * (1 + self.elongation) ** (power / 4)
+        self._frequencies[power] = mean
         return mean
+
+    @property
+    def cancellation(self) -> float:
+        """How much larger displacements are than elongations, whose rounding errors they bring: beyond tenfold.
+
+        A wave of small k has 1 / k; a ring that is struck moves on as a whole, by v t / N against some v / sqrt(N).
+        """
+        largest = float(self._state.displacement.abs().max()) / (10 * self.elongation)
+        drift = self.end / math.sqrt(self.n) if self.impulse and self.scene.boundary == "periodic" else 0.0
+        return max(1.0, largest, drift)
 
     @property
     def growing(self) -> float:
@@ -130,32 +144,48 @@ class Facts:
 
 
 def settle(method: str, facts: Facts, tolerance: float, dtype: torch.dtype) -> tuple[dict[str, Any], float]:
-    """The coarsest options of a method that keep to the tolerance, and the error predicted for them.
-
-    Errors are relative to the scale of the observables; those of energies are twice those of the phases.
-    """
-    eps = EPS[dtype]
-    phase = facts.limit * facts.end
-    if method in ("modes", "tridiagonal"):
-        return {}, eps * (100 + 8 * phase)
-    if method == "damped":
-        return {}, eps * (4000 + 40 * phase)
+    """The coarsest options of a method that keep to the tolerance, and the error predicted for them."""
+    options: dict[str, Any] = {}
     if method == "chebyshev":
-        accuracy = max(1e-13, min(1e-4, tolerance / 10))
-        return {"accuracy": accuracy}, accuracy + eps * (100 + 20 * math.sqrt(phase))
+        options = {"accuracy": max(1e-13, min(1e-4, tolerance / 10))}
+    elif method == "dopri8":
+        options = {"rtol": max(1e-13, min(1e-4, 0.5 * tolerance / _growth(facts)))}
+    elif method in STEPPERS:
+        order, _, _, limit = STEPPERS[method]
+        step = min((0.9 * tolerance / _step_error(method, facts)) ** (1 / order), 0.7 * limit / facts.limit)
+        if facts.scene.damping > 0:
+            step = min(step, 0.7 / (facts.scene.damping * facts.limit**2))
+        options = {"step": min(step, facts.end or 1.0)}
+    return options, error_of(method, facts, options, dtype)
+
+
+def error_of(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype) -> float:
+    """Predicted error of a method, relative to the scale of the observables."""
+    eps, phase = EPS[dtype], facts.limit * facts.end
+    if method in STEPPERS:
+        order, _, forces, _ = STEPPERS[method]
+        walk = math.sqrt(forces * facts.end / options["step"])  # of the rounding errors of the steps
+        return _step_error(method, facts) * options["step"] ** order + eps * (100 + 20 * walk) * facts.cancellation
     if method == "dopri8":
-        growth = 8 * max(1.0, facts.growing) * max(1.0, facts.frequency(1) / 2)
-        rtol = max(1e-13, min(1e-4, 0.5 * tolerance / growth))
-        return {"rtol": rtol}, growth * rtol + eps * (100 + 8 * phase)
-    order, constant, forces, limit = STEPPERS[method]
-    scale = 2 * constant * facts.frequency(order + 1) * max(facts.growing, 1.0)
+        return _growth(facts) * options["rtol"] + eps * (100 + 40 * phase)
+    return options.get("accuracy", 0.0) + eps * ((4000 if method == "damped" else 100) + 40 * phase)
+
+
+def _step_error(method: str, facts: Facts) -> float:
+    """Error per step^order: the phases' w^(order + 1) t where these matter, else the swing of the energy.
+
+    Energies are off by twice what phases are, and the largest error of a field is larger than its mean.
+    """
+    order, constant, _, _ = STEPPERS[method]
     if facts.scene.observables == ("total_energy",) and facts.scene.damping == 0:
-        scale = (constant * 6) * facts.frequency(order)  # it only swings
-    step = min((0.5 * tolerance / scale) ** (1 / order), 0.7 * limit / facts.limit, facts.end or 1.0)
-    if facts.scene.damping > 0:
-        step = min(step, 0.7 / (facts.scene.damping * facts.limit**2))
-    rounding = eps * (100 + 4 * math.sqrt(forces * facts.end / step) + (phase if dtype == torch.float32 else 0))
-    return {"step": step}, scale * step**order + rounding
+        return 6 * constant * facts.frequency(order)
+    margin = 5 if "displacement" in facts.scene.observables else 3
+    return margin * constant * facts.frequency(order + 1) * max(facts.growing, 1.0)
+
+
+def _growth(facts: Facts) -> float:
+    """Error of the adaptive method over its relative tolerance per step."""
+    return 8 * max(1.0, facts.growing) * max(1.0, facts.frequency(1) / 2)
 
 
 # ---------------------------------------------------------------------------------------------------------------- costs
@@ -163,11 +193,13 @@ def settle(method: str, facts: Facts, tolerance: float, dtype: torch.dtype) -> t
 
 def seconds(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
     """Predicted wall time of a run: what every run takes, and the method's work spread over the cores."""
+    from torchchain.ensemble import layout
+
     kernels = method in ("chebyshev", *STEPPERS)
-    workers = min(machine.cores, facts.chains)
-    alone = facts.chains == 1
-    parallel = min(machine.cores, facts.rows) if alone and kernels else 1
-    rounds = math.ceil(facts.chains / workers)
+    cut = layout(facts.scene, method, facts.scene.observables, torch.device("cpu"))
+    chunks, workers = math.ceil(facts.chains / cut.size), min(cut.workers, machine.cores)
+    parallel = min(machine.cores, facts.rows) if facts.chains == 1 and kernels else 1
+    rounds = math.ceil(chunks / workers) * min(cut.size, facts.chains)
     work = {
         "modes": _modes, "tridiagonal": _modes, "chebyshev": _chebyshev, "verlet": _steps, "symplectic4": _steps,
         "damped": _damped, "dopri8": _adaptive,
@@ -178,12 +210,15 @@ def seconds(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dty
         each += facts.rows * facts.n**2 * 4 * machine.entry
         if method != "modes":
             each += _decomposition("modes", facts.n, machine)
-    once = machine.compilation if kernels else 0.0
-    return machine.run + once + rounds * each + (CALLS[method] + 10 * len(facts.in_time)) * machine.call
+    once = machine.compilation or machine.loading * (not kernels_loaded()) if kernels else 0.0
+    calls = CALLS[method] + 20 * len(facts.in_time) + 150 * (facts.reach is not None)  # whose Python waits for the others'
+    return machine.run + once + rounds * each + (chunks * calls + facts.chains * CALLS["realization"]) * machine.call
 
 
+# Small operations of a chunk, and of a realization in the statistics: counted as time over that of one operation.
 CALLS = {
-    "modes": 150, "tridiagonal": 160, "chebyshev": 40, "verlet": 60, "symplectic4": 60, "damped": 250, "dopri8": 100,
+    "modes": 640, "tridiagonal": 640, "chebyshev": 340, "verlet": 1100, "symplectic4": 1100, "damped": 1250,
+    "dopri8": 1500, "realization": 55,
 }  # fmt: skip
 
 
@@ -288,6 +323,5 @@ def _damped(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dty
 
 def _adaptive(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
     steps = 0.3 * facts.count + 0.27 * facts.end * options["rtol"] ** (-1 / 8)
-    workers = min(machine.cores, facts.chains)  # whose Python waits for each other's, chains sharing the steps
-    calls = 64 * machine.call * workers / math.ceil(facts.chains / workers)
-    return steps * 13 * (calls + 300 * facts.rows * facts.n * machine.entry) + _observing(facts, machine)
+    calls = 100 * machine.call * min(machine.cores, facts.chains)  # whose Python waits for each other's
+    return steps * 13 * (calls + 400 * facts.rows * facts.n * machine.entry) + _observing(facts, machine)

@@ -138,7 +138,7 @@ def difference(old: np.ndarray, new: np.ndarray) -> str:
     if old.tobytes() == new.tobytes():
         return ""
     with np.errstate(invalid="ignore"):
-        apart = np.nan_to_num(abs(new - old), nan=0.0)
+        apart = np.nan_to_num(abs(new - old), nan=0.0, posinf=np.inf)
         changed = int((~((old == new) | (np.isnan(old) & np.isnan(new)))).sum())
         finite = abs(old[np.isfinite(old)])
     return (
