@@ -255,6 +255,22 @@ def test_what_a_scene_asks_beyond_the_calibration(small_transfer):
         assert not message or any(__import__("re").search(message, text) for text in found), found
 
 
+def test_bands_can_be_joined_but_not_split(small_transfer):
+    master = tc.calibrate(small_transfer, "projection", order=(1, 1), bootstrap=0)
+    half = small_transfer.n_bands // 2
+    joined = master.coarsened(half)
+    times = small_transfer.times
+    fine = master.model.transfer(times).unflatten(0, (half, 2)).mean(1).unflatten(-1, (half, 2)).sum(-1)
+    assert torch.allclose(joined.model.transfer(times), fine, rtol=0, atol=1e-13)
+    assert joined.conservation_defect < 1e-12
+    assert joined.calibration.scene.n_bands == half
+    for count in (0, small_transfer.n_bands * 2, half + 1):
+        with pytest.raises(FieldError, match="n_bands must"):
+            master.coarsened(count)
+    with pytest.raises(FieldError, match="model must be 'memory'"):
+        tc.calibrate(small_transfer, "linear", "paper").coarsened(half)
+
+
 # Energy fed in over time
 
 

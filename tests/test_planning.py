@@ -1,16 +1,21 @@
 """The plan: what it may choose, that it keeps to tolerances, and that its record of the machine is checked."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
 import torchchain as tc
-from torchchain import machine, planning
+from torchchain import ensemble, machine, planning
 from torchchain.checks import FieldError
+from torchchain.cli import main
 from torchchain.machine import Machine
+from torchchain.planning import forecast
+from torchchain.reach import ReachExceeded, reach
+from torchchain.scene import regular_times
 
-TYPICAL = Machine(compilation=0.0)
+TYPICAL = Machine(compilation=0.0, loading=0.0)
 
 
 def scene(**fields):
@@ -26,8 +31,9 @@ def scene(**fields):
     [
         ({}, {"modes", "tridiagonal", "chebyshev", "verlet", "symplectic4"}),
         ({"boundary": "periodic"}, {"modes", "chebyshev", "verlet", "symplectic4"}),
-        ({"contact": "hertz"}, {"verlet", "symplectic4"}),
-        ({"damping": 0.1}, {"damped", "verlet"}),
+        ({"contact": "hertz"}, {"verlet", "symplectic4", "dopri8"}),
+        ({"damping": 0.1}, {"damped", "verlet", "dopri8"}),
+        ({"contact": "hertz", "damping": 0.1}, {"verlet", "dopri8"}),
     ],
 )
 def test_only_methods_that_can_treat_the_scene(fields, methods):
@@ -49,21 +55,91 @@ def test_error_of_a_planned_step_is_within_the_tolerance(tolerance, method):
     assert float((found - exact).abs().max() / exact.abs().max()) <= tolerance
 
 
-def test_long_chains_go_without_matrices_and_short_ones_at_late_times_with_modes():
-    long = scene(n_particles=4096, times=torch.arange(0.0, 100.0, 10.0))
-    assert planning.plan(long, TYPICAL).method == "chebyshev"
-    late = scene(n_particles=32, times=torch.tensor([5e5]))
-    assert planning.plan(late, TYPICAL).method in ("modes", "tridiagonal")
+WHOLE = {"excitation": tc.StandingWave(tones=(7,)), "observables": ("energy",), "tolerance": 1e-8}
+
+
+@pytest.mark.parametrize(
+    ("fields", "method"),
+    [
+        ({"n_particles": 32, "times": torch.tensor([5e5]), "tolerance": 1e-6}, "tridiagonal"),
+        ({"n_particles": 32, "times": torch.tensor([5e5]), "tolerance": 1e-6, "boundary": "periodic"}, "modes"),
+        ({"n_particles": 100_000, "times": torch.arange(0.0, 100.0, 10.0), "tolerance": 1e-8}, "chebyshev"),
+        ({"n_particles": 4096, "times": torch.arange(0.0, 500.0, 100.0), **WHOLE}, "chebyshev"),
+        ({"n_particles": 512, "contact": "hertz", "tolerance": 1e-6}, "symplectic4"),
+        ({"n_particles": 64, "damping": 0.1, "tolerance": 1e-9}, "damped"),
+        ({"n_particles": 4096, "damping": 0.1, "tolerance": 1e-3, **{**WHOLE, "tolerance": 1e-3}}, "verlet"),
+    ],
+)
+def test_clear_cut_scenes(fields, method):
+    assert planning.plan(scene(**fields), TYPICAL).method == method
 
 
 def test_a_cold_kernel_is_not_compiled_for_a_small_job():
     assert planning.plan(scene(), Machine()).method in ("modes", "tridiagonal")
 
 
+def test_float32_only_where_the_tolerance_allows_it():
+    loose, tight = (planning.plan(scene(n_particles=512, contact="hertz", tolerance=t), TYPICAL) for t in (1e-2, 1e-9))
+    assert loose.dtype == torch.float32
+    assert loose.run_options["dtype"] == "float32"
+    assert tight.dtype == torch.float64
+    assert "dtype" not in tight.run_options
+
+
+def test_float32_as_chosen_keeps_to_the_tolerance():
+    wanted = scene(
+        n_particles=512,
+        contact="hertz",
+        tolerance=1e-2,
+        observables=("energy",),
+        excitation=tc.Impulse(site=200, velocity=0.3),
+    )
+    chosen = planning.plan(wanted, TYPICAL)
+    assert chosen.dtype == torch.float32
+    found = tc.simulate(wanted, chosen.method, options=chosen.run_options).energy
+    exact = tc.simulate(wanted, "dopri8", options={"rtol": 1e-8}).energy
+    assert float(abs(found - exact).max() / abs(exact).max()) <= 1e-2
+
+
+VARIED = [
+    {"excitation": tc.Impulse(site=32), "observables": ("energy",), "boundary": "periodic"},
+    {"excitation": tc.StandingWave(tones=(5, 20)), "observables": ("displacement",)},
+    {"excitation": tc.StandingWave(tones=(3,)), "observables": ("band_energy",), "n_bands": 8, "boundary": "periodic"},
+    {"excitation": tc.Impulse(site=3), "observables": ("width",), "disorder": tc.Disorder(strength=0.5)},
+]
+
+
+@pytest.mark.parametrize("fields", VARIED)
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-7])
+def test_predicted_errors_are_bounds(fields, tolerance):
+    """Every way that the plan lists, against another exact one."""
+    wanted = scene(**fields, tolerance=tolerance)
+    for choice in planning.plan(wanted, TYPICAL).choices:
+        options = {**choice.options, **({"dtype": "float32"} if choice.dtype == torch.float32 else {})}
+        if not choice.good or options.get("step", 1.0) < 1e-3:
+            continue
+        found = tc.simulate(wanted, choice.method, options=options)
+        exact = tc.simulate(wanted, "chebyshev" if choice.method == "modes" else "modes")
+        for name in wanted.observables:
+            error = float(abs(found[name] - exact[name]).max() / abs(exact[name]).max())
+            assert error <= choice.predicted_error, (choice, error)
+
+
 def test_without_a_tolerance_the_ensemble_sets_it():
     few, many = (planning.plan(scene(realizations=r), TYPICAL) for r in (4, 400))
     assert few.tolerance == pytest.approx(10 * many.tolerance)
     assert "ensemble's own error" in few.reasons[0]
+
+
+def test_without_a_tolerance_the_method_adds_little_to_the_error_of_the_ensemble():
+    wanted = scene(realizations=40, observables=("energy",), excitation=tc.Impulse(site=32))
+    planned = planning.plan(wanted)
+    assert planned.predicted_error <= planned.tolerance
+    exact = tc.simulate(wanted, "modes")
+    found = tc.simulate(wanted)
+    statistical = float((exact.energy_stderr / exact.energy.max()).max())
+    assert float(abs(found.energy - exact.energy).max() / exact.energy.max()) <= statistical / 3
+    assert planned.tolerance <= statistical  # of the noisiest particle and time
 
 
 def test_impossible_tolerance_is_refused_with_the_reachable_one():
@@ -73,10 +149,11 @@ def test_impossible_tolerance_is_refused_with_the_reachable_one():
 
 def test_auto_gives_what_the_plan_names():
     wanted = scene(realizations=3)
+    tc.simulate(wanted, "chebyshev")  # loads the kernels, which the plan counts
     named = planning.plan(wanted)
     torch.testing.assert_close(
         torch.from_numpy(tc.simulate(wanted).center.values),
-        torch.from_numpy(tc.simulate(wanted, named.method, options=named.options).center.values),
+        torch.from_numpy(tc.simulate(wanted, named.method, options=named.run_options).center.values),
         rtol=0,
         atol=0,
     )
@@ -95,3 +172,159 @@ def test_plan_prints_its_reasons_and_runners_up():
     text = str(planning.plan(scene(), TYPICAL))
     for word in ("method", "tolerance", "error", "time", "because", "runner-up"):
         assert word in text
+
+
+@pytest.mark.parametrize(("velocity", "law"), [(0.001, "linear"), (0.3, "hertz")])
+def test_contact_law_follows_the_amplitude(velocity, law):
+    wanted = scene(
+        contact="auto", tolerance=1e-2, excitation=tc.Impulse(site=20, velocity=velocity), observables=("energy",)
+    )
+    planned = planning.plan(wanted, TYPICAL)
+    assert planned.scene.contact == planning.resolved(wanted).contact == law
+    assert law in planned.reasons[1].lower()
+    if law == "linear":  # the contact that was left out would have made no more difference than was allowed
+        found, hertz = (tc.simulate(replace(wanted, contact=c, energy_definition="bond")) for c in ("auto", "hertz"))
+        assert float(abs(found.energy - hertz.energy).max() / hertz.energy.max()) < 1e-2
+    else:
+        assert tc.simulate(wanted).attrs["method"] in ("verlet", "symplectic4")
+
+
+def test_hertz_by_amplitude_has_no_bands():
+    waves = tc.StandingWave(amplitude=0.5)
+    wanted = scene(contact="auto", tolerance=1e-6, excitation=waves, observables=("band_energy",), n_bands=4)
+    with pytest.raises(FieldError, match=r"contact must be 'linear' for the observable band_energy"):
+        tc.simulate(wanted)
+
+
+@pytest.mark.parametrize("boundary", ["fixed", "periodic"])
+@pytest.mark.parametrize("contact", ["linear", "hertz"])
+def test_the_part_that_a_wave_reaches_gives_what_the_whole_chain_does(boundary, contact, monkeypatch):
+    every = ("center", "width", "energy", "displacement", "source_energy", "total_energy")
+    wanted = scene(
+        n_particles=400, boundary=boundary, contact=contact, observables=every, times=torch.arange(0.0, 31.0, 5.0),
+        excitation=tc.Impulse(site=230, velocity=0.2),
+    )  # fmt: skip
+    part = reach(wanted)
+    assert part is not None
+    assert part.size < 200
+    cut = tc.simulate(wanted, "symplectic4", options={"step": 0.2})
+    monkeypatch.setattr(ensemble, "reach", lambda scene: None)
+    whole = tc.simulate(wanted, "symplectic4", options={"step": 0.2})
+    for name in every:
+        scale = float(abs(whole[name]).max())
+        assert float(abs(cut[name] - whole[name]).max()) <= 1e-13 * scale, name
+    assert cut.attrs["mass_mean"] == whole.attrs["mass_mean"]
+
+
+def test_a_wave_that_leaves_its_part_is_computed_on_the_whole_chain(monkeypatch):
+    wanted = scene(n_particles=400, times=torch.tensor([30.0]), excitation=tc.Impulse(site=200))
+    part = reach(wanted)
+    short = replace(part, first=190, last=211)
+    chain = short.chain(wanted.chain([0]))
+    with pytest.raises(ReachExceeded):
+        short.check(chain, tc.evolve(chain, short.state(wanted.state(wanted.chain([0]))), [30.0]))
+    expected = tc.simulate(wanted, "modes")
+    monkeypatch.setattr(ensemble, "reach", lambda scene: short)
+    found = tc.simulate(wanted, "modes")
+    assert float(found.center[0]) == pytest.approx(float(expected.center[0]), rel=1e-12)
+
+
+def test_bands_rings_struck_at_the_seam_and_late_times_need_the_whole_chain():
+    fields = {"n_particles": 400, "times": torch.tensor([30.0]), "excitation": tc.Impulse(site=200)}
+    assert reach(scene(**fields)) is not None
+    assert reach(scene(**{**fields, "excitation": tc.Impulse(site=1), "boundary": "periodic"})) is None
+    assert reach(scene(**{**fields, "times": torch.tensor([1000.0])})) is None
+    assert reach(scene(**{**fields, "observables": ("wavenumber_energy",)})) is None
+
+
+@pytest.fixture(scope="module")
+def master():
+    transfer = tc.band_transfer(transfer_scene())
+    return tc.calibrate(transfer)
+
+
+def transfer_scene(**fields):
+    given = {"n_particles": 32, "n_bands": 4, "times": regular_times(0.0, 40.0, 0.5), "realizations": 40}
+    return tc.Scene(**{**given, **fields})
+
+
+def test_a_calibrated_model_takes_the_place_of_the_chains_where_it_covers_the_scene(master, tmp_path):
+    wanted = transfer_scene(tolerance=0.2, times=regular_times(0.0, 40.0, 0.01), realizations=1000)
+    planned = planning.plan(wanted, TYPICAL, artifact=master)
+    assert planned.method == planning.ARTIFACT
+    exact = tc.band_transfer(replace(wanted, times=regular_times(0.0, 40.0, 1.0)), "modes", long_time=False)
+    found = master.solve(torch.eye(4, dtype=torch.float64), exact.times).detach()
+    assert float((found - exact.mean).abs().max()) <= 0.2
+    file = tmp_path / "q.safetensors"
+    master.save(file)
+    again = planning.plan(wanted, TYPICAL, artifact=file)
+    assert again.method == planning.ARTIFACT
+    assert again.predicted_error == pytest.approx(planned.predicted_error)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"disorder": tc.Disorder(strength=0.1)}, "disorder 0.1"),
+        ({"boundary": "fixed"}, "boundary fixed"),
+        ({"n_bands": 8}, "bands 8"),
+        ({"observables": ("energy",)}, "energy, where it predicts energies of bands"),
+        ({"excitation": tc.Impulse()}, "an impulse"),
+        ({"tolerance": 1e-6}, "not accurate enough"),
+    ],
+)
+def test_a_calibrated_model_that_does_not_fit_is_named_and_left(master, fields, words):
+    planned = planning.plan(transfer_scene(**fields), TYPICAL, artifact=master)
+    assert planned.method != planning.ARTIFACT
+    assert words in planned.reasons[-1]
+
+
+def test_command_plan_takes_a_model_file(master, tmp_path, capsys):
+    file = tmp_path / "q.safetensors"
+    master.save(file)
+    flags = ["--n-particles", "32", "--n-bands", "4", "--tolerance", "0.2", "--times.stop", "40"]
+    assert main(["plan", *flags, "--artifact", str(file)]) == 0
+    assert "the master equation at hand covers the scene" in capsys.readouterr().out
+    assert main(["plan", *flags, "--artifact", str(tmp_path / "none.safetensors")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "readable" in error
+
+
+def test_a_run_reports_what_was_predicted_beside_what_was_measured(tmp_path, capsys):
+    flags = [
+        "--n-particles",
+        "32",
+        "--n-bands",
+        "4",
+        "--realizations",
+        "3",
+        "--times.stop",
+        "5",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    assert main(["simulate", *flags]) == 0
+    record = json.loads((tmp_path / "run" / "run.json").read_text())["forecast"]
+    assert set(record) == {"predicted_seconds", "seconds", "predicted_error", "statistical_error"}
+    assert min(record.values()) > 0
+    assert "s predicted" in capsys.readouterr().out
+    how = {"method": "rk4", "method_options": "{}"}
+    assert set(forecast(scene(), how, 1.0, 0.1)) == {"seconds", "statistical_error"}
+
+
+def test_chains_too_long_for_the_memory_of_a_method_leave_it_out():
+    wanted = scene(
+        n_particles=300_000, excitation=tc.StandingWave(tones=(5,)), times=torch.tensor([10.0]), tolerance=1e-3
+    )
+    planned = planning.plan(wanted, TYPICAL)
+    assert planned.method == "chebyshev"
+    assert not {"modes", "tridiagonal"} & {other.method for other in planned.runners_up}
+
+
+def test_measured_speeds_are_positive_and_reproduce_within_a_factor(tmp_path):
+    first, second = machine.measure(), machine.measure()
+    for name in ("call", "draw", "entry", "flop", "update", "hertz", "stencil"):
+        a, b = getattr(first, name), getattr(second, name)
+        assert 0 < a < 1e-3
+        assert 1 / 8 < a / b < 8, name

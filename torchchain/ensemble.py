@@ -178,13 +178,15 @@ class Chunk:
         """The named observables at all times, (realization, [tone,] *axes)."""
         if not names:
             return {}
-        if self.reach is not None and not _is_fused(self.method, names):
+        if self.reach is not None and self.reach.pays(_is_fused(self.method, names)):
             with suppress(ReachExceeded):  # the whole chain, then
                 return self._observe_part(self.reach, names)
         if _is_fused(self.method, names):
             given = (self.chain, self.state, self.times)
             definition = self.scene.energy_definition
             with self.stages("evolution with observables"):
+                if self.watch is not None:
+                    self.watch(self.chain, start(self.chain, self.state, self.method, **self.options)(self.times[-1:]))
                 if "band_energy" in names:
                     return {
                         "band_energy": fused.band_energy(*given, self.scene.n_bands, True, definition, **self.options)

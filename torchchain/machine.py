@@ -17,7 +17,7 @@ from torchchain.disorder import Disorder
 from torchchain.excitation import Impulse, impulse, standing_wave
 from torchchain.threads import single_thread
 
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Machine:
     compilation: float = 20.0
     loading: float = 0.5
     run: float = 2.0e-3
-    call: float = 3.0e-6
+    call: float = 1.2e-6
     draw: float = 4.0e-8
     entry: float = 6.0e-10
     trig: float = 8.0e-9
@@ -194,7 +194,7 @@ def _tensors() -> dict[str, float]:
             many * many + many
 
     return {
-        "call": 2 * _seconds(calls) / 50,
+        "call": _seconds(calls) / 50,
         "entry": _seconds(passes) / 8 / len(many),
         "trig": _seconds(many.cos) / len(many),
         "flop": _seconds(lambda: rows @ square) / (2 * 512 * 256 * 256),

@@ -104,6 +104,25 @@ def distance_curve(ax: Axes, times: np.ndarray, distance: np.ndarray, statistica
     return ax
 
 
+def chapman_kolmogorov(ax: Axes, times: np.ndarray, distance: np.ndarray, statistical: np.ndarray, label: str) -> Axes:
+    """Total variation of T(n lag) and T(lag)^n over time, mean over sources, arrays [source, time]; dotted: by noise alone."""
+    (line,) = ax.plot(times, distance.mean(0), "o-", label=label)
+    ax.plot(times, statistical.mean(0), ":", color=line.get_color())
+    ax.set(xlabel=TIME_LABEL, ylabel=r"total variation of $T(n\,\tau)$ and $T(\tau)^n$")
+    return ax
+
+
+def implied_timescales(ax: Axes, lags: np.ndarray, timescales: np.ndarray, stderr: np.ndarray, shown: int = 5) -> Axes:
+    """The slowest implied timescales over the lag, [lag, timescale]; below the diagonal a timescale is shorter than the lag."""
+    for i in range(min(shown, timescales.shape[1])):
+        ax.errorbar(
+            lags, timescales[:, i], stderr[:, i], fmt="o-", capsize=2, markersize=4, label=f"{i + 2}. eigenvalue"
+        )
+    ax.fill_between(lags, lags, 0, color="0.9", linewidth=0)
+    ax.set(xlabel=r"lag $\tau$", ylabel=r"implied timescale $-\tau / \log|\lambda|$", yscale="log")
+    return ax
+
+
 def exponents(ax: Axes, x: np.ndarray, fits: Sequence[Any], xlabel: str) -> Axes:
     """Exponents of power laws with error bars, and the slopes in both halves of each one's window.
 

@@ -147,7 +147,7 @@ def settle(method: str, facts: Facts, tolerance: float, dtype: torch.dtype) -> t
     """The coarsest options of a method that keep to the tolerance, and the error predicted for them."""
     options: dict[str, Any] = {}
     if method == "chebyshev":
-        options = {"accuracy": max(1e-13, min(1e-4, tolerance / 10))}
+        options = {"accuracy": max(1e-13, min(1e-4, tolerance / 20))}
     elif method == "dopri8":
         options = {"rtol": max(1e-13, min(1e-4, 0.5 * tolerance / _growth(facts)))}
     elif method in STEPPERS:
@@ -168,7 +168,8 @@ def error_of(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dt
         return _step_error(method, facts) * options["step"] ** order + eps * (100 + 20 * walk) * facts.cancellation
     if method == "dopri8":
         return _growth(facts) * options["rtol"] + eps * (100 + 40 * phase)
-    return options.get("accuracy", 0.0) + eps * ((4000 if method == "damped" else 100) + 40 * phase)
+    local = 5 * options.get("accuracy", 0.0)  # that of the whole state may lie where the state is small
+    return local + eps * ((4000 if method == "damped" else 100) + 40 * phase)
 
 
 def _step_error(method: str, facts: Facts) -> float:
@@ -178,14 +179,14 @@ def _step_error(method: str, facts: Facts) -> float:
     """
     order, constant, _, _ = STEPPERS[method]
     if facts.scene.observables == ("total_energy",) and facts.scene.damping == 0:
-        return 6 * constant * facts.frequency(order)
+        return 12 * constant * facts.frequency(order)
     margin = 5 if "displacement" in facts.scene.observables else 3
     return margin * constant * facts.frequency(order + 1) * max(facts.growing, 1.0)
 
 
 def _growth(facts: Facts) -> float:
     """Error of the adaptive method over its relative tolerance per step."""
-    return 8 * max(1.0, facts.growing) * max(1.0, facts.frequency(1) / 2)
+    return 16 * max(1.0, facts.growing) * max(1.0, facts.frequency(1) / 2)
 
 
 # ---------------------------------------------------------------------------------------------------------------- costs
@@ -211,14 +212,14 @@ def seconds(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dty
         if method != "modes":
             each += _decomposition("modes", facts.n, machine)
     once = machine.compilation or machine.loading * (not kernels_loaded()) if kernels else 0.0
-    calls = CALLS[method] + 20 * len(facts.in_time) + 150 * (facts.reach is not None)  # whose Python waits for the others'
+    calls = CALLS[method] + 40 * len(facts.in_time) + 300 * (facts.reach is not None)  # whose Python waits for the others'
     return machine.run + once + rounds * each + (chunks * calls + facts.chains * CALLS["realization"]) * machine.call
 
 
 # Small operations of a chunk, and of a realization in the statistics: counted as time over that of one operation.
 CALLS = {
-    "modes": 640, "tridiagonal": 640, "chebyshev": 340, "verlet": 1100, "symplectic4": 1100, "damped": 1250,
-    "dopri8": 1500, "realization": 55,
+    "modes": 1200, "tridiagonal": 1200, "chebyshev": 650, "verlet": 2100, "symplectic4": 2100, "damped": 2400,
+    "dopri8": 2500, "realization": 100,
 }  # fmt: skip
 
 
@@ -288,14 +289,17 @@ def _chebyshev(method: str, facts: Facts, options: dict[str, Any], dtype: torch.
         sums += repeats * leaps * both * mean
         orders += 0 if mirrored else repeats * leaps * (z / leaps * outputs + 60)
         longest = max(longest, whole)
+    cut = facts.reach is not None and facts.reach.pays(fused)
+    whole_chain = facts.n if cut else facts.scene.n_particles
+    if cut and fused:  # the check
+        stencils, sums = (work + math.ceil(limit * facts.end / 256) * terms(256, accuracy) for work in (stencils, sums))
     size = facts.moving(longest / 2)
     spent = facts.rows * (size * (stencils * machine.stencil + sums * machine.sum) + orders * machine.order)
-    spent += facts.rows * (stencils / 4 * machine.pass_call + facts.scene.n_particles * machine.scratch)
-    spent += facts.scene.n_particles * machine.layout
+    spent += facts.rows * (stencils / 4 * machine.pass_call + whole_chain * machine.scratch)
+    spent += whole_chain * machine.layout
     points = facts.rows * facts.count
     if not fused:
-        whole_n = facts.scene.n_particles
-        return spent + points * whole_n * 2 * machine.entry + _observing(facts, machine) * whole_n / facts.n
+        return spent + points * facts.n * 2 * machine.entry + _observing(facts, machine)
     if facts.in_time == ["band_energy"]:
         return spent + points * facts.n * machine.transform
     return spent + points * size * machine.moment * bool(facts.in_time)
@@ -322,6 +326,9 @@ def _damped(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dty
 
 
 def _adaptive(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
+    from torchchain.ensemble import layout
+
     steps = 0.3 * facts.count + 0.27 * facts.end * options["rtol"] ** (-1 / 8)
-    calls = 100 * machine.call * min(machine.cores, facts.chains)  # whose Python waits for each other's
+    cut = layout(facts.scene, method, facts.scene.observables, torch.device("cpu"))
+    calls = 120 * machine.call * min(cut.workers, machine.cores) / cut.size  # whose Python waits for the others'
     return steps * 13 * (calls + 400 * facts.rows * facts.n * machine.entry) + _observing(facts, machine)

@@ -16,6 +16,7 @@ from torchchain.scene import Scene
 
 LOCAL_OBSERVABLES = frozenset({"center", "displacement", "energy", "source_energy", "total_energy", "width"})
 WORTHWHILE = 0.7  # a part of the chain larger than this is not worth cutting out
+WORTHWHILE_FUSED = 0.25  # nor one larger than this for kernels that skip what is at rest, as the check is a run of its own
 EDGE = 4  # particles beside a cut that must stay at rest
 AT_REST = 1e-28  # share of the energy, 1e-14 of the amplitude
 
@@ -35,6 +36,10 @@ class Reach:
     @property
     def size(self) -> int:
         return self.last - self.first
+
+    def pays(self, fused: bool) -> bool:
+        """Whether cutting out the part saves time, for kernels that measure on their own, too."""
+        return not fused or self.size < WORTHWHILE_FUSED * self.n_particles
 
     def chain(self, chain: Chain) -> Chain:
         """The part as a chain of its own, between walls where it was cut: particles beyond stay at rest."""

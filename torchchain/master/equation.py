@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from torchchain import checks
 from torchchain.master import artifact
+from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
 from torchchain.master.solvers import SOLVERS, IntegrationError
 from torchchain.master.trust import Uncertainty
@@ -217,6 +218,31 @@ class MasterEquation(nn.Module):
                 f"{scene.n_particles} particles, calibrated on {own.n_particles}, and waves that go round by t = {shorter}"
             )
         return found
+
+    def coarsened(self, n_bands: int) -> MasterEquation:
+        """The model of fewer and wider bands, each of several of the present ones, for energy spread evenly in a band.
+
+        Exact for a model with memory: its transfer is averaged over the sources and summed over the receivers of a
+        band. More bands than were calibrated, or rates alone, cannot be had this way.
+
+        Raises:
+            FieldError: for a number of bands that does not divide the present one, or a model without memory.
+        """
+        if not isinstance(self.model, MemoryModel):
+            raise checks.fail("model", "be 'memory' to be coarsened", repr(self.calibration.model))
+        n_bands = checks.integer("n_bands", n_bands, 1, self.n_bands)
+        if self.n_bands % n_bands:
+            raise checks.fail("n_bands", f"divide the {self.n_bands} bands of the model", n_bands)
+        size = self.n_bands // n_bands
+        joined = torch.eye(n_bands, dtype=self.rates.dtype, device=self.rates.device).repeat_interleave(size, dim=0)
+        tensors = self.model.tensors()
+        for name in ("rates", "basis", "amplitudes"):
+            tensors[name] = joined.T / size @ tensors[name] @ joined
+        tensors["damping"] = tensors["damping"] @ joined / size
+        scene = self.calibration.scene
+        scene = replace(scene, n_bands=n_bands, excitation=replace(scene.excitation, tones=None))
+        report = {"coarsened_from": self.n_bands, "horizon": self._report.get("horizon", "infinite")}
+        return MasterEquation(MemoryModel(**tensors), replace(self.calibration, scene=scene, report=report))
 
     def forward(self, initial: Tensor, times: Tensor) -> Tensor:
         """:meth:`solve` by the matrix exponential."""
