@@ -32,7 +32,7 @@ class Config(Ensemble):
     """particles per chain: up to 128 bands of two tones"""
     step: float = 0.5
     """time step of the output"""
-    realizations: int = 60
+    realizations: int = 40
     """chains in the ensemble, and in the fresh one"""
     strength: float = 0.3
     """disorder xi"""
@@ -42,7 +42,7 @@ class Config(Ensemble):
     """numbers of bands B"""
     largest_search: int = 32
     """bands beyond which 'nonlinear' and 'adam' are left out"""
-    adam_steps: int = 300
+    adam_steps: int = 200
     """at most"""
     horizon: float = 1000.0
     """late time at which the total energy is looked at"""

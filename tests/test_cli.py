@@ -322,7 +322,7 @@ FLAGS = [
     ("--observables enrgy", "observables must be one of band_energy, "),
     ("--observables", "observables must be a list of names"),
     ("--observables energy energy", "observables must be different"),
-    ("--contact glue", "contact must be one of linear, hertz, got 'glue'"),
+    ("--contact glue", "contact must be one of linear, hertz, auto, got 'glue'"),
     ("--contact hertz", "contact must be 'linear' for the observable band_energy"),
     ("--contact hertz --observables energy", "contact must be linear for method 'modes'"),
     ("--damping -1", "damping must be at least 0"),

@@ -9,7 +9,9 @@ import pytest
 import torch
 import xarray
 
+import torchchain as tc
 from torchchain import cli, commands, ranks
+from torchchain.checkpoint import Checkpoint
 from torchchain.ranks import ALONE, Ranks
 from torchchain.statistics import joined
 
@@ -84,16 +86,33 @@ def test_a_process_that_dies_is_started_again_and_goes_on(tmp_path, alone):
     assert record["resumed_realizations"] >= 4 * 2  # of the one that died: all but the chunk it was in
 
 
-def test_one_process_takes_up_what_two_left(tmp_path, alone):
-    (tmp_path / "death.py").write_text(DEATH)
-    arguments = ["simulate", *FLAGS, "--checkpoint-every", "0"]
-    done = torchrun(2, tmp_path, *arguments, "--out", "two", program=("death.py",))
-    assert done.returncode != 0
-    assert os.listdir(tmp_path / "two") == ["checkpoint"]
-    assert "00001-00001.safetensors" in os.listdir(tmp_path / "two" / "checkpoint")
-    two = alone(*arguments, out="two")
-    assert data_of(two / "results.nc") == data_of(alone("simulate", *FLAGS, out="one") / "results.nc")
-    assert json.loads((two / "run.json").read_text())["resumed_realizations"] >= 4 * 2
+class Lost(Ranks):
+    """A process whose neighbors end before the moments meet."""
+
+    begin = None
+
+    def agree(self, value):
+        Lost.begin = value if self.rank == 0 else Lost.begin
+        return Lost.begin
+
+    def total(self, moments):
+        raise RuntimeError("another process of this run has ended")
+
+
+@pytest.mark.parametrize("method", ["modes", "chebyshev"])
+@pytest.mark.parametrize("size", [2, 3, 8])
+def test_one_process_takes_up_what_others_left(size, method, tmp_path):
+    scene = tc.Scene(n_particles=16, n_bands=4, realizations=45, seed=3, times=[0.0, 1.0, 7.0])
+    expected = tc.simulate(scene, method)
+    for rank in range(size - 1):  # the last one leaves nothing
+        with pytest.raises(RuntimeError, match="has ended"):
+            tc.simulate(scene, method, checkpoint=Checkpoint(tmp_path, 0), ranks=Lost(rank, size))
+    assert len(os.listdir(tmp_path)) == size - 1
+    again = Checkpoint(tmp_path, 0)
+    found = tc.simulate(scene, method, checkpoint=again)
+    assert 0 < again.resumed < 45
+    assert found.identical(expected)
+    assert all(found[name].values.tobytes() == expected[name].values.tobytes() for name in found.variables)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 64])

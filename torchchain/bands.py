@@ -42,6 +42,9 @@ def bin_energy(energy: Tensor, n_bands: int) -> Tensor:
     Returns:
         (*batch, band).
     """
+    energy = checks.real_tensor("energy", energy)
+    if energy.ndim == 0:
+        raise checks.fail("energy", "have wavenumbers on its last axis", "shape ()")
     tones = energy.shape[-1] - 1
     width = check_bands(2 * tones, n_bands)
     return energy[..., 1:].reshape(*energy.shape[:-1], n_bands, width).sum(-1)

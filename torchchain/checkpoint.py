@@ -72,6 +72,7 @@ class Checkpoint:
     """
 
     def __init__(self, folder: str | Path, every: float = EVERY) -> None:
+        checks.instance("checkpoint", folder, str, Path)
         self.folder = Path(folder)
         self.every = checks.number("checkpoint_every", every, at_least=0)
         self.resumed = 0
@@ -295,7 +296,7 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
     for name in sorted(tensors):
         values = tensors[name].detach()
         digest.update(f"\n{name} {values.dtype} {tuple(values.shape)}\n".encode())
-        digest.update(values.contiguous().view(-1).view(torch.uint8).numpy())
+        digest.update(values.contiguous().view(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
 
 

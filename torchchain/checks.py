@@ -83,11 +83,25 @@ def choice(field: str, value: Any, choices: Iterable[str]) -> str:
     return value
 
 
+def truth(field: str, value: Any) -> bool:
+    """The value, if it is True or False."""
+    if not isinstance(value, bool):
+        raise FieldTypeError(f"{field} must be True or False, got {shown(value)}")
+    return value
+
+
+def instance(field: str, value: Any, *kinds: type) -> None:
+    """An error unless the value is of one of the kinds."""
+    if not isinstance(value, kinds):
+        words = " or ".join("None" if kind is type(None) else f"a {kind.__name__}" for kind in kinds)
+        raise FieldTypeError(f"{field} must be {words}, got {shown(value)}")
+
+
 def device(field: str, value: Any) -> torch.device:
     """The value as a device that this machine has: "cpu", "cuda" or "cuda:<number>"."""
     try:
         found = torch.empty(0, device=torch.device(value)).device
-    except (RuntimeError, AssertionError, TypeError) as error:
+    except (RuntimeError, AssertionError, TypeError, ValueError) as error:
         raise fail(field, "be available here", f"{value!r}: {str(error).splitlines()[0][:100]}") from None
     if found.type not in ("cpu", "cuda"):
         raise fail(field, "be cpu, cuda or cuda:<number>", repr(value))
@@ -106,14 +120,25 @@ def real_tensor(field: str, value: Any) -> Tensor:
     """The value as a finite tensor of float32 or float64 (float64 unless it is a tensor of either)."""
     if not isinstance(value, Tensor):
         value = _float64_tensor(field, value)
+    if value.layout != torch.strided or value.device.type == "meta":
+        raise FieldTypeError(f"{field} must be a dense tensor with data, got {value.layout} on {value.device}")
     if not value.is_floating_point():
         if value.is_complex() or value.dtype == torch.bool:
             raise FieldTypeError(f"{field} must be real floating-point numbers, got dtype {value.dtype}")
         value = value.to(torch.float64)
     if value.dtype not in (torch.float32, torch.float64):
         raise FieldTypeError(f"{field} must be of dtype float32 or float64, got {value.dtype}")
-    first_bad(field, "be finite", value, ~torch.isfinite(value))
+    finite(field, value)
     return value
+
+
+def finite(field: str, values: Tensor, axis: str = "position") -> Tensor:
+    """The values, if all are finite numbers; one pass over them, where they are."""
+    if values.numel():
+        low, high = values.detach().aminmax()
+        if not bool((high - low).isfinite()):  # also where only the difference overflows
+            first_bad(field, "be finite", values, ~values.isfinite(), axis)
+    return values
 
 
 def _float64_tensor(field: str, value: Any) -> Tensor:

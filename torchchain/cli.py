@@ -99,7 +99,7 @@ class SceneFlags:
             self,
             skip=(
                 "config", "out", "device", "method", "fit", "model", "window", "constraint", "penalty",
-                "checkpoint_every", "threads", "artifact",
+                "bootstrap", "checkpoint_every", "threads", "artifact",
             ),
         )  # fmt: skip
 
@@ -133,13 +133,15 @@ class Calibrate(SceneFlags):
     fit: str | None = None
     """analytic, linear, nonlinear, adam or projection (default: the best for the model)"""
     model: str | None = None
-    """paper, exact_psi, basis_matrix or memory (default: the most accurate)"""
+    """paper, exact_psi, basis_matrix, swing_in or memory (default: the smallest that reaches the ensemble's own error)"""
     window: tuple[float, float] | None = None
     """first and last time of the short-time fits (default 0.5 2)"""
     constraint: str | None = None
     """adam: exact (default) or penalty"""
     penalty: float | None = None
     """adam: weight of the conservation penalty (default 10)"""
+    bootstrap: int | None = None
+    """ensembles drawn again for the error bars, 0 for none (default 20, or none where fits take long)"""
     checkpoint_every: float = 5.0
     """seconds between saves of finished realizations in the folder, from which the same command goes on"""
     threads: int | None = None
@@ -147,7 +149,7 @@ class Calibrate(SceneFlags):
 
     def calibration(self) -> dict[str, Any]:
         """The flags of the fit that were given."""
-        given = {name: getattr(self, name) for name in ("model", "window", "constraint", "penalty")}
+        given = {name: getattr(self, name) for name in ("model", "window", "constraint", "penalty", "bootstrap")}
         return {k: v for k, v in {"method": self.fit, **given}.items() if v is not None}
 
 
@@ -156,7 +158,9 @@ class Predict:
     """Band energies from a calibrated master equation."""
 
     model: Annotated[str, tyro.conf.Positional]
-    """file written by calibrate"""
+    """file written by calibrate, or by family"""
+    strength: float | None = None
+    """disorder at which a family predicts"""
     source: tuple[int, ...] | None = None
     """bands that start with a unit energy, a run of its own each (default: every band)"""
     initial: tuple[float, ...] | None = None
@@ -176,6 +180,16 @@ class Predict:
     def overrides(self) -> dict[str, Any]:
         """The flags that were given, as nested plain values."""
         return _given(self, skip=("model", "config", "out", "device", "method", "seed"))
+
+
+@dataclass(frozen=True)
+class Family:
+    """One model file for a range of disorder, from model files of calibrate at several strengths."""
+
+    models: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """files written by calibrate, with the model "memory" """
+    out: str = "results/family"
+    """folder for model.safetensors and run.json"""
 
 
 @dataclass(frozen=True)
@@ -201,7 +215,7 @@ class Rerun:
 
 
 COMMANDS: dict[str, Any] = {
-    "simulate": Simulate, "calibrate": Calibrate, "predict": Predict, "plan": Plan, "rerun": Rerun,
+    "simulate": Simulate, "calibrate": Calibrate, "predict": Predict, "family": Family, "plan": Plan, "rerun": Rerun,
 }  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,10 +19,10 @@ import xarray
 
 from torchchain import checks, outputs, planning, plots, ranks
 from torchchain.checkpoint import Checkpoint, Interrupted
-from torchchain.cli import Calibrate, Plan, Predict, Rerun, SceneFlags, Simulate
+from torchchain.cli import Calibrate, Family, Plan, Predict, Rerun, SceneFlags, Simulate
 from torchchain.ensemble import BandTransfer, Stages, band_transfer, simulate
 from torchchain.evolvers import METHODS
-from torchchain.master import SOLVERS, MasterEquation, calibrate
+from torchchain.master import SOLVERS, MasterEquation, MasterFamily, calibrate
 from torchchain.master.calibration import recipe
 from torchchain.scene import Scene, describe, read_toml, regular_times
 from torchchain.statistics import statistical_distance, total_variation
@@ -41,6 +42,8 @@ def run(flags: Any, arguments: list[str]) -> int:
                 return rerun(flags)
     elif isinstance(flags, Predict):
         run_predict(flags, arguments)
+    elif isinstance(flags, Family):
+        run_family(flags, arguments)
     elif isinstance(flags, Plan):
         print(planning.plan(_scene(flags)[0], artifact=flags.artifact))
     return 0
@@ -225,7 +228,7 @@ def run_calibrate(
     if not isinstance(table, Mapping):
         raise checks.FieldTypeError(f"calibration must be a table, got {checks.shown(table)}")
     settings = _merge(table, flags.calibration())
-    checks.known_keys("calibration", settings, ("method", "model", "window", "constraint", "penalty", "steps", "learning_rate", "tolerance", "order"))  # fmt: skip
+    checks.known_keys("calibration", settings, ("method", "model", "window", "constraint", "penalty", "steps", "learning_rate", "tolerance", "order", "bootstrap"))  # fmt: skip
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])
@@ -308,9 +311,23 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
             "model",
             f"{master.calibration.model}, fitted by {master.calibration.method}, {master.model.n_parameters} parameters",
         ),
-        ("conservation defect", master.model.conservation_defect),
+        *([("conservation defect", master.model.conservation_defect)] if transfer.scene.damping == 0 else []),
         ("lowest predicted share of energy", float(predicted.min())),
     ]
+    report = master.calibration.report
+    if "selection" in report:
+        rows.insert(1, ("chosen", report["selection"]))
+    if "damping" in report:
+        lost = 1 - transfer.mean.sum(-1)
+        rows.append(
+            (
+                "energy lost: root mean square error of the prediction",
+                float((1 - predicted.sum(-1) - lost).square().mean().sqrt()),
+            )
+        )
+    rows.append(
+        ("compared with chains up to", "infinite time" if master.horizon == math.inf else f"t = {master.horizon:g}")
+    )
     if bool(early.any()):
         rows.append((f"total variation to the ensemble, 0 < t <= {end / 2:g}", float(distance[:, early].mean())))
     if bool(late.any()):
@@ -366,7 +383,39 @@ def calibration_figure(transfer: BandTransfer, master: MasterEquation, predicted
     return figure
 
 
-PREDICT_KEYS = ("source", "initial", "times")
+PREDICT_KEYS = ("strength", "source", "initial", "times")
+
+
+def _loaded(path: str, strength: Any) -> MasterEquation:
+    """The model of a file, or that of a family at a strength."""
+    if strength is None:
+        return MasterEquation.load(path)
+    return MasterFamily.load(path).at(checks.number("strength", strength, at_least=0))
+
+
+def run_family(flags: Family, arguments: list[str]) -> None:
+    """Join models of several strengths and leave the family and its record."""
+    began = time.time()
+    if not flags.models:
+        raise checks.fail("models", "be at least one file", "none")
+    out = outputs.check_writable(flags.out)
+    family = MasterFamily([MasterEquation.load(path) for path in flags.models])
+    times = torch.linspace(0, 500, 101, dtype=torch.float64)[1:]
+    left_out = family.leave_one_out(times)
+    outputs.write(
+        out,
+        {
+            "model.safetensors": family.save,
+            "run.json": outputs.run_record(
+                arguments, "", "cpu", began, {}, strengths=list(family.strengths), left_out=left_out,
+                models=[{"path": str(Path(path).resolve()), "sha256": outputs.sha256(path)} for path in flags.models],
+            ),
+        },
+    )  # fmt: skip
+    print(f"disorder 0 to {family.strengths[-1]:g}, calibrated at {', '.join(f'{xi:g}' for xi in family.strengths)}")
+    for strength, distance in left_out:
+        print(f"left out and predicted by the others, 0 < t <= 500: {strength:g}, total variation {distance:.4f}")
+    print(f"results in {out}")
 
 
 def run_predict(flags: Predict, arguments: list[str]) -> None:
@@ -379,7 +428,7 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
     out, device = outputs.check_writable(flags.out), str(checks.device("device", flags.device))
     stages = Stages()
     with stages("loading"):
-        master = MasterEquation.load(flags.model).to(device)
+        master = _loaded(flags.model, given.get("strength")).to(device)
         digest = outputs.sha256(flags.model)
     n = master.n_bands
     times = given.get("times", {})
@@ -424,11 +473,17 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
         },
         attrs={"model": str(Path(flags.model).name), "calibrated_on": master.calibration.scene.to_toml()},
     )
+    if master.uncertainty is not None:
+        error = master.standard_error(starts, wanted).cpu().numpy()
+        note = {"units": "energy of the start", "long_name": "standard error of the energy in a band"}
+        data["band_energy_stderr"] = data["band_energy"].copy(data=error).assign_attrs(note)
     shown = [0] if len(labels) == 1 else [round((len(labels) - 1) * f) for f in (10 / 32, 23 / 32)]
     figure, axes = _figure(5.5 * len(shown), 4, 1, len(shown))
     for ax, index in zip(axes[0], shown, strict=True):
         total = float(starts[index].sum()) or 1.0
         plots.band_map(ax, wanted.numpy(), energy[index].numpy() / total, f"start: {labels[index]}")
+    if "strength" in given:
+        request["strength"] = float(given["strength"])
     text = tomli_w.dumps({**request, "times": wanted.tolist()})
     outputs.write(
         out,
@@ -445,5 +500,7 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
     print(f"{len(labels)} starts, {len(wanted)} times to {float(wanted[-1]):g}, solved by {flags.method}")
     print(f"largest change of total energy: {float((energy.sum(-1) - starts.sum(-1)[:, None]).abs().max()):.3g}")
     print(f"lowest energy in a band: {float(energy.min()):.3g}")
+    if "band_energy_stderr" in data:
+        print(f"largest standard error: {float(data.band_energy_stderr.max()):.3g}")
     print("seconds: " + ", ".join(f"{name} {seconds:.4f}" for name, seconds in stages.seconds.items()))
     print(f"results in {out}")

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchchain import checks
 
 KINDS = ("normal", "uniform", "binary", "lognormal", "gamma")
+LARGEST_CHAIN = 10**8
 _MASSES, _STIFFNESSES = 0, 1  # the random streams of a realization
 _NEGLIGIBLE = 1e-20  # a strength below the resolution of a float64 next to 1
 
@@ -66,18 +67,21 @@ class Disorder:
         Returns:
             (realization, particle), float64 on the CPU.
         """
-        return self._sample(checks.integer("n_particles", n_particles, 1), realizations, seed, _MASSES)
+        return self._sample(checks.integer("n_particles", n_particles, 1, LARGEST_CHAIN), realizations, seed, _MASSES)
 
     def stiffnesses(self, n_contacts: int, realizations: int | Iterable[int], seed: int) -> Tensor:
         """Contact stiffnesses in units of the mean stiffness, (realization, contact), independent of the masses."""
-        return self._sample(checks.integer("n_contacts", n_contacts, 1), realizations, seed, _STIFFNESSES)
+        return self._sample(checks.integer("n_contacts", n_contacts, 1, LARGEST_CHAIN + 1), realizations, seed, _STIFFNESSES)
 
     def _sample(self, size: int, realizations: int | Iterable[int], seed: int, stream: int) -> Tensor:
         seed = checks.integer("seed", seed, 0, 2**64 - 1)
         if checks.is_collection(realizations):
             numbers = [checks.integer("realizations", i, 0, 2**63) for i in realizations]
         else:
-            numbers = list(range(checks.integer("realizations", realizations, 1)))
+            realizations = checks.integer("realizations", realizations, 1, 10**9)
+            _require_room(size, realizations)
+            numbers = list(range(realizations))
+        _require_room(size, len(numbers))
         uniform = np.empty((len(numbers), size))
         for row, i in enumerate(numbers):
             bits = np.random.Philox(key=np.array([seed, i], dtype=np.uint64), counter=[0, 0, 0, stream])
@@ -119,3 +123,16 @@ class Disorder:
             sigma = np.sqrt(np.log1p(xi**2))
             return special.ndtr((np.log(value) + sigma**2 / 2) / sigma)
         return special.gammainc(xi**-2, value / xi**2)
+
+
+def _require_room(size: int, realizations: int) -> None:
+    """An error for draws that the memory cannot hold, before any is made."""
+    from torchchain import footprint
+
+    needed, limit = 24 * size * realizations, footprint.memory(torch.device("cpu"))
+    if needed > limit:
+        raise checks.fail(
+            "realizations",
+            f"take at most the {footprint.gigabytes(limit)} of memory of this machine",
+            f"{realizations} of {size} values: about {footprint.gigabytes(needed)}",
+        )

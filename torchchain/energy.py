@@ -14,10 +14,29 @@ from torchchain.evolvers.method import Trajectory
 DEFINITIONS = ("site", "bond")
 
 
+def checked(chain: Chain, trajectory: Trajectory) -> None:
+    """An error unless these are a chain and a trajectory with its particles."""
+    checks.instance("chain", chain, Chain)
+    checks.instance("trajectory", trajectory, Trajectory)
+    n, shape = chain.n_particles, getattr(trajectory.displacement, "shape", ())
+    for field in ("displacement", "velocity"):
+        value = getattr(trajectory, field)
+        checks.instance(f"trajectory.{field}", value, Tensor)
+        if value.dtype not in (torch.float32, torch.float64) or value.layout != torch.strided or value.is_meta:
+            raise checks.FieldTypeError(
+                f"trajectory.{field} must be a dense tensor of float32 or float64, got {value.dtype} on {value.device}"
+            )
+        if value.ndim < 2 or value.shape[-1] != n or value.shape != shape:
+            raise checks.fail(
+                f"trajectory.{field}", f"have shape (*batch, time, {n}), one for both", f"shape {tuple(value.shape)}"
+            )
+
+
 def kinetic_energy(chain: Chain, trajectory: Trajectory) -> Tensor:
     """Kinetic energy of every particle (Eq. 30), (*batch, time, particle)."""
+    checked(chain, trajectory)
     velocity = trajectory.velocity
-    return chain.align(chain.masses, velocity) * velocity.square() / 2
+    return checks.finite("energy of trajectory", chain.align(chain.masses, velocity) * velocity.square() / 2, "particle")
 
 
 def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "site") -> Tensor:
@@ -30,12 +49,13 @@ def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "si
             the energy of both contacts (Eq. A3), never negative, and counts the whole of a wall contact for its
             one particle. Both have the same sum for linear contacts. Hertz contacts have only "bond".
     """
+    checked(chain, trajectory)
     checks.choice("definition", definition, DEFINITIONS)
     displacement = trajectory.displacement
     if definition == "site":
         require_linear(chain, "definition 'bond'")
-        return -chain.force(displacement) * displacement / 2
-    contact = chain.contact_energy(displacement) / 2
+        return checks.finite("energy of trajectory", -chain.force(displacement) * displacement / 2, "particle")
+    contact = checks.finite("energy of trajectory", chain.contact_energy(displacement) / 2, "contact")
     if chain.boundary == "periodic":
         return contact + contact.roll(-1, -1)
     energy = contact[..., 1:] + contact[..., :-1]
@@ -51,7 +71,8 @@ def particle_energy(chain: Chain, trajectory: Trajectory, definition: str = "sit
 
 def total_energy(chain: Chain, trajectory: Trajectory) -> Tensor:
     """Energy of the whole chain relative to the precompressed state (Eq. 41), (*batch, time)."""
-    return kinetic_energy(chain, trajectory).sum(-1) + chain.contact_energy(trajectory.displacement).sum(-1)
+    total = kinetic_energy(chain, trajectory).sum(-1) + chain.contact_energy(trajectory.displacement).sum(-1)
+    return checks.finite("energy of trajectory", total, "time")
 
 
 def require_linear(chain: Chain, remedy: str) -> None:
@@ -77,12 +98,13 @@ def energy_matrices(chain: Chain, trajectory: Trajectory) -> EnergyMatrices:
     N times the memory of the diagonal, which is all that the rest of the library uses: for looking at the
     correlations between particles.
     """
+    checked(chain, trajectory)
     require_linear(chain, "total_energy or particle_energy with definition 'bond'")
     displacement, velocity = trajectory.displacement, trajectory.velocity
     masses = chain.align(chain.masses, velocity)
     kinetic = torch.einsum("...p,...q->...pq", masses * velocity, velocity) / 2
     potential = torch.einsum("...p,...q->...pq", chain.force(displacement), displacement) / -2
-    return EnergyMatrices(kinetic, potential, kinetic + potential)
+    return EnergyMatrices(kinetic, potential, checks.finite("energy of trajectory", kinetic + potential, "particle"))
 
 
 def energy_center(energy: Tensor) -> Tensor:

@@ -463,6 +463,7 @@ def ensemble_moments(
     """
     realizations = 1 if scene.is_ordered else scene.realizations
     device, stages = checks.device("device", device), stages or Stages()
+    checks.instance("options", options, dict, type(None))
     checks.choice("method", method, ("auto", *METHODS))
     layout(scene, method, names, device)
     if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
@@ -675,6 +676,33 @@ class BandTransfer:
     block_counts: tuple[int, ...]
     attributes: dict[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        checks.instance("scene", self.scene, Scene)
+        checks.instance("attributes", self.attributes, dict)
+        object.__setattr__(self, "times", checks.times("times", self.times))
+        counts, n = self.block_counts, self.scene.n_bands
+        if not isinstance(counts, (list, tuple)) or not counts:
+            raise checks.FieldTypeError(f"block_counts must be a list of integers, got {checks.shown(counts)}")
+        object.__setattr__(self, "block_counts", tuple(checks.integer("block_counts", c, 1) for c in counts))
+        whole, late, blocks = (n, len(self.times), n), (n, n), len(counts)
+        shapes = {
+            "mean": whole, "stderr": whole, "long_time": late, "long_time_stderr": late,
+            "block_mean": (blocks, *whole), "block_long_time": (blocks, *late),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is None and "long_time" in name and self.long_time is None:
+                continue
+            checks.instance(name, value, Tensor)
+            if value.layout != torch.strided or value.is_meta or not value.is_floating_point():
+                raise checks.FieldTypeError(f"{name} must be a dense floating-point tensor, got {value.dtype}")
+            if tuple(value.shape) != shape:
+                raise checks.fail(name, f"have shape {shape}", f"shape {tuple(value.shape)}")
+            if "stderr" in name:  # infinite for one realization
+                checks.first_bad(name, "not be negative", value, ~(value >= 0), "band")
+            else:
+                checks.real_tensor(name, value)
+
     @property
     def n_bands(self) -> int:
         return self.mean.shape[-1]
@@ -705,13 +733,34 @@ class BandTransfer:
 
     @classmethod
     def from_dataset(cls, data: xarray.Dataset) -> BandTransfer:
-        """The inverse of :meth:`to_dataset`."""
+        """The inverse of :meth:`to_dataset`.
+
+        Raises:
+            FieldError, FieldTypeError: for a dataset that is not of a band transfer.
+        """
         import tomllib
 
-        scene = Scene.from_dict(tomllib.loads(data.attrs["scene"]))
+        checks.instance("data", data, xarray.Dataset)
+        needed = ("band_energy", "band_energy_stderr", "block_band_energy", "block_count")
+        late = ("long_time", "long_time_stderr", "block_long_time") if "long_time" in data else ()
+        for name in (*needed, *late):
+            if name not in data:
+                raise checks.fail("data", f"hold the variable {name} of a band transfer", f"{', '.join(map(str, data))}")
+        for name in ("scene", "mass_mean", "mass_sd"):
+            if name not in data.attrs:
+                raise checks.fail("data", f"have the attribute {name} of a band transfer", "none")
+        try:
+            scene = Scene.from_dict(tomllib.loads(str(data.attrs["scene"])))
+        except (ValueError, RecursionError) as error:
+            raise checks.fail("data", "have the attribute scene of a band transfer", str(error)) from None
+        if "time" in data.coords and not np.array_equal(data["time"].values, scene.times.numpy()):
+            raise checks.fail("data", "have the times of its scene", checks.shown(data["time"].values))
 
         def tensor(name: str) -> Tensor:
-            return torch.from_numpy(np.array(data[name].values))
+            values = np.array(data[name].values)
+            if values.dtype not in (np.float32, np.float64):
+                raise checks.FieldTypeError(f"data.{name} must be of float32 or float64, got {values.dtype}")
+            return torch.from_numpy(values)
 
         held = "long_time" in data
         return cls(
@@ -723,8 +772,8 @@ class BandTransfer:
             tensor("long_time_stderr") if held else None,
             tensor("block_band_energy"),
             tensor("block_long_time") if held else None,
-            tuple(int(n) for n in data["block_count"].values),
-            {name: float(data.attrs[name]) for name in ("mass_mean", "mass_sd")}
+            tuple(checks.integer("data.block_count", n, 1) for n in np.atleast_1d(data["block_count"].values)),
+            {name: checks.number(f"data.{name}", data.attrs[name]) for name in ("mass_mean", "mass_sd")}
             | {name: str(data.attrs[name]) for name in ("method", "method_options") if name in data.attrs},
         )
 
@@ -758,6 +807,7 @@ def band_transfer(
     Raises:
         FieldError: if the excitation is no standing wave, or a band has not exactly one tone.
     """
+    checks.truth("long_time", long_time)
     scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
     long_time = long_time and scene.damping == 0
     realizations = 1 if scene.is_ordered else scene.realizations

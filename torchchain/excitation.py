@@ -51,6 +51,7 @@ def impulse(chain: Chain, site: int = 1, velocity: float = 0.01) -> State:
     Returns:
         State (*batch, particle).
     """
+    checks.instance("chain", chain, Chain)
     site = checks.integer("site", site, 1, chain.n_particles)
     velocity = checks.number("velocity", velocity)
     start = torch.zeros_like(chain.masses)
@@ -70,6 +71,7 @@ def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float 
     Returns:
         State (*batch, particle), or (*batch, tone, particle) for a sequence.
     """
+    checks.instance("chain", chain, Chain)
     n = chain.n_particles
     several = checks.is_collection(tone)
     tones: list[Any] = list(tone) if checks.is_collection(tone) else [tone]

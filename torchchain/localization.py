@@ -47,8 +47,10 @@ def lyapunov_exponent(
     Returns:
         Estimate with gamma per particle.
     """
+    checks.instance("disorder", disorder, Disorder)
+    checks.instance("stiffness_disorder", stiffness_disorder, Disorder, type(None))
     w = checks.real_tensor("frequencies", frequencies).to(torch.float64)
-    checks.first_bad("frequencies", "not be negative", w, w < 0)
+    checks.first_bad("frequencies", "lie between 0 and 1e100", w, (w < 0) | (w > 1e100))
     if w.ndim != 1:
         raise checks.fail("frequencies", "be one-dimensional", f"shape {tuple(w.shape)}")
     realizations = checks.integer("realizations", realizations, 2)
@@ -73,7 +75,7 @@ def lyapunov_exponent(
 
 def weak_disorder_lyapunov(strength: float, frequencies: Any) -> Tensor:
     """gamma = xi^2 w^2 / (8 (1 - w^2 / 4)) for weak mass disorder (Matsuda and Ishii 1970), (frequency,), 0 <= w < 2."""
-    strength = checks.number("strength", strength, at_least=0)
+    strength = checks.number("strength", strength, at_least=0, at_most=1e100)
     w = checks.real_tensor("frequencies", frequencies)
     checks.first_bad("frequencies", "lie in [0, 2)", w, (w < 0) | (w >= 2))
     return strength**2 * w.square() / (8 * (1 - w.square() / 4))
@@ -92,6 +94,7 @@ def count_modes_below(chain: Chain, frequencies: Any) -> Tensor:
     Returns:
         (*batch, frequency), int64.
     """
+    checks.instance("chain", chain, Chain)
     w = checks.real_tensor("frequencies", frequencies).to(chain.masses)
     checks.first_bad("frequencies", "not be negative", w, w < 0)
     if w.ndim != 1:
@@ -135,7 +138,9 @@ def integrated_density_of_states(
         frequencies: (frequency,).
         n_particles, realizations, seed: the fixed chains that are counted.
     """
+    checks.instance("disorder", disorder, Disorder)
     realizations = checks.integer("realizations", realizations, 2)
+    checks.integer("n_particles", n_particles, 2)
     chain = Chain(disorder.masses(n_particles, realizations, seed), boundary="fixed")
     with single_thread():
         share = count_modes_below(chain, frequencies).to(torch.float64) / n_particles

@@ -131,6 +131,10 @@ def plan(scene: Scene, machine: Machine | None = None, artifact: str | Path | Ma
     Raises:
         FieldError: if no method can treat the scene, or none reaches the tolerance.
     """
+    checks.instance("scene", scene, Scene)
+    checks.instance("machine", machine, Machine, type(None))
+    if artifact is not None and type(artifact).__name__ != "MasterEquation":
+        checks.instance("artifact", artifact, str, Path)
     machine = machine or this_machine()
     with single_thread():
         return _plan(scene, machine, artifact)
@@ -144,9 +148,7 @@ def _plan(scene: Scene, machine: Machine, artifact: str | Path | MasterEquation 
     if not usable:
         raise checks.fail("method", "treat the scene's contact, boundary, damping and size", "none")
     precisions = {name: (torch.float64, torch.float32) if name in SINGLE else (torch.float64,) for name in usable}
-    choices = [
-        _choice(name, facts, tolerance, dtype, machine) for name in usable for dtype in precisions[name]
-    ]
+    choices = [_choice(name, facts, tolerance, dtype, machine) for name in usable for dtype in precisions[name]]
     remarks: list[str] = []
     if artifact is not None:
         found, remarks = _stand_in(scene, artifact, tolerance)
@@ -205,6 +207,7 @@ def forecast_line(record: Mapping[str, Any]) -> str:
 
 def resolved(scene: Scene) -> Scene:
     """The scene with the contact law "auto" settled."""
+    checks.instance("scene", scene, Scene)
     if scene.contact != "auto":
         return scene
     with single_thread():
@@ -267,9 +270,7 @@ def _choice(name: str, facts: Facts, tolerance: float, dtype: torch.dtype, machi
     return Choice(name, options, error, seconds(name, facts, options, dtype, machine), tolerance, dtype)
 
 
-def _stand_in(
-    scene: Scene, artifact: str | Path | MasterEquation, tolerance: float
-) -> tuple[list[Choice], list[str]]:
+def _stand_in(scene: Scene, artifact: str | Path | MasterEquation, tolerance: float) -> tuple[list[Choice], list[str]]:
     """A prediction in place of the chains, if the calibration covers the scene, and what is to be said of it.
 
     Its error holds the noise of its own ensemble, which takes the place of the scene's: without a tolerance it may be

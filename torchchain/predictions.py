@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from torchchain.chain import Chain
 from torchchain.evolvers.drift import total
 from torchchain.evolvers.linearity import elongation_estimate, force_deviation
 from torchchain.excitation import Impulse, State
@@ -212,8 +210,9 @@ def seconds(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dty
         if method != "modes":
             each += _decomposition("modes", facts.n, machine)
     once = machine.compilation or machine.loading * (not kernels_loaded()) if kernels else 0.0
-    calls = CALLS[method] + 40 * len(facts.in_time) + 300 * (facts.reach is not None)  # whose Python waits for the others'
-    return machine.run + once + rounds * each + (chunks * calls + facts.chains * CALLS["realization"]) * machine.call
+    calls = CALLS[method] + 40 * len(facts.in_time) + 300 * (facts.reach is not None)
+    python = (chunks * calls + facts.chains * CALLS["realization"]) * machine.call  # one thread's waits for the others'
+    return machine.run + once + rounds * each + python
 
 
 # Small operations of a chunk, and of a realization in the statistics: counted as time over that of one operation.
@@ -235,7 +234,7 @@ def _decomposition(method: str, n: int, machine: Machine) -> float:
 def _observing(facts: Facts, machine: Machine) -> float:
     """Observables of one chain from its states, transforms included, and their part in the statistics."""
     states = facts.rows * facts.count * facts.n
-    passes = sum(PASSES[name] for name in facts.in_time)
+    passes = float(sum(PASSES[name] for name in facts.in_time))
     if facts.bands or "wavenumber_energy" in facts.scene.observables:
         passes += 8 * math.log2(facts.n)
     return states * passes * machine.entry

@@ -35,7 +35,8 @@ class Ranks:
         if self.size == 1:
             return value
         held = [value]
-        dist.broadcast_object_list(held, src=0, device=_HOST)
+        with _connected():
+            dist.broadcast_object_list(held, src=0, device=_HOST)
         return held[0]
 
     def share(self, ranges: Sequence[range], multiple: int = 1) -> list[range]:
@@ -65,13 +66,14 @@ class Ranks:
         bitwise the same for any number of ranks.
         """
         step = 1
-        while step < self.size:
-            if self.rank % (2 * step):
-                _send(moments, self.rank - step)
-                break
-            if self.rank + step < self.size:
-                moments.absorb(_received(moments, self.rank + step))
-            step *= 2
+        with _connected():
+            while step < self.size:
+                if self.rank % (2 * step):
+                    _send(moments, self.rank - step)
+                    break
+                if self.rank + step < self.size:
+                    moments.absorb(_received(moments, self.rank + step))
+                step *= 2
         return moments
 
     def everywhere(self, moments: EnsembleMoments) -> EnsembleMoments:
@@ -82,8 +84,9 @@ class Ranks:
         names = self.agree([(name, tuple(values.shape), values.dtype) for name, values in plain.items()])
         if self.rank:
             plain = {name: torch.empty(shape, dtype=dtype) for name, shape, dtype in names}
-        for name, _, _ in names:
-            dist.broadcast(plain[name], src=0)
+        with _connected():
+            for name, _, _ in names:
+                dist.broadcast(plain[name], src=0)
         return moments if self.rank == 0 else EnsembleMoments.from_tensors(*_plan(moments), plain)
 
 
@@ -103,7 +106,13 @@ def process_group(device: str | torch.device = "cpu") -> Iterator[Ranks]:
         yield ALONE
         return
     cuda = torch.device(device).type == "cuda"
-    dist.init_process_group("cpu:gloo,cuda:nccl" if cuda else "gloo", timeout=_PATIENCE)
+    store, rank, size = next(dist.rendezvous("env://", timeout=_PATIENCE))
+    if os.environ.get("GROUP_WORLD_SIZE") == "1":
+        # torchrun's store outlives a restart: a process would meet the addresses of those that died. Machines count
+        # restarts each for itself, so that several need TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1 in its place.
+        store = dist.PrefixStore(f"restart {os.environ.get('TORCHELASTIC_RESTART_COUNT', 0)}", store)
+    backend = "cpu:gloo,cuda:nccl" if cuda else "gloo"
+    dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=_PATIENCE)
     try:
         yield Ranks(dist.get_rank(), dist.get_world_size())
     finally:
@@ -137,6 +146,15 @@ def fair_threads() -> int:
         return torch.get_num_threads()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // neighbors)
+
+
+@contextmanager
+def _connected() -> Iterator[None]:
+    """A lost connection in one line: what the library says of it names addresses alone."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise RuntimeError("another process of this run has ended or cannot be reached") from error
 
 
 def _plan(moments: EnsembleMoments) -> tuple[int, int]:

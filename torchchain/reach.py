@@ -16,7 +16,7 @@ from torchchain.scene import Scene
 
 LOCAL_OBSERVABLES = frozenset({"center", "displacement", "energy", "source_energy", "total_energy", "width"})
 WORTHWHILE = 0.7  # a part of the chain larger than this is not worth cutting out
-WORTHWHILE_FUSED = 0.25  # nor one larger than this for kernels that skip what is at rest, as the check is a run of its own
+WORTHWHILE_FUSED = 0.25  # nor one larger than this for kernels that skip what is at rest: the check is a run of its own
 EDGE = 4  # particles beside a cut that must stay at rest
 AT_REST = 1e-28  # share of the energy, 1e-14 of the amplitude
 

@@ -98,13 +98,12 @@ def _again(record: Mapping[str, Any], folder: Path, out: Path, flags: Rerun) -> 
             )
             commands.run_predict(request, record["arguments"])
             return
-        kind, run = {
-            "simulate": (Simulate, commands.run_simulate),
-            "calibrate": (Calibrate, commands.run_calibrate),
-        }[record["arguments"][0]]
-        resolved = record["resolved"]
-        request = kind(config=config, out=place, device=device, method=resolved["method"])
-        run(request, record["arguments"], resolved["options"], keep=flags.out is not None)
+        resolved, keep = record["resolved"], flags.out is not None
+        how = {"config": config, "out": place, "device": device, "method": resolved["method"]}
+        if record["arguments"][0] == "simulate":
+            commands.run_simulate(Simulate(**how), record["arguments"], resolved["options"], keep)
+        else:
+            commands.run_calibrate(Calibrate(**how), record["arguments"], resolved["options"], keep)
 
 
 def _model(recorded: Mapping[str, str]) -> str:

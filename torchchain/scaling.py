@@ -40,6 +40,13 @@ class Scaling:
                 {"above": -1.0, "at_most": 0.5} if entry.name == "poisson_ratio" else {"above": 0.0}
             )
             object.__setattr__(self, entry.name, checks.number(f"si.{entry.name}", getattr(self, entry.name), **bounds))
+        try:
+            units = [self.unit(quantity) for quantity in QUANTITIES]
+        except (OverflowError, ZeroDivisionError):
+            units = []
+        if not units or not all(0 < unit < math.inf for unit in units):
+            given = ", ".join(f"{entry.name} {getattr(self, entry.name):g}" for entry in fields(self))
+            raise checks.fail("si", "give units that are finite numbers above 0", given)
         if self.overlap >= 0.1 * self.radius:
             raise checks.fail(
                 "si.force", "make an overlap below a tenth of the radius, where Hertz contacts hold", self.force

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -27,6 +27,39 @@ class NormalModes:
     frequencies: Tensor
     shapes: Tensor
 
+    def __post_init__(self) -> None:
+        for field in ("frequencies", "shapes"):
+            object.__setattr__(self, field, checks.real_tensor(field, getattr(self, field)))
+        checks.first_bad("frequencies", "not be negative", self.frequencies, self.frequencies < 0, "mode")
+
+
+def modes_of(chain: Chain, modes: NormalModes) -> NormalModes:
+    """The modes, checked to be those of the chain: shapes, and the products with one vector that they must give.
+
+    Raises:
+        FieldError: for modes of another chain.
+    """
+    checks.instance("modes", modes, NormalModes)
+    batch, n = tuple(chain.batch_shape), chain.n_particles
+    shapes, squared = modes.shapes, modes.frequencies.square()
+    if tuple(shapes.shape) != (*batch, n, n) or tuple(squared.shape) != (*batch, n):
+        raise checks.fail(
+            "modes", f"have frequencies and shapes of {(*batch, n)} and {(*batch, n, n)}",
+            f"{tuple(squared.shape)} and {tuple(shapes.shape)}",
+        )  # fmt: skip
+    if (shapes.dtype, shapes.device) != (chain.masses.dtype, chain.masses.device) or squared.dtype != shapes.dtype:
+        raise checks.fail("modes", "have dtype and device of the chain", f"{shapes.dtype} on {shapes.device}")
+    with torch.no_grad():
+        vector = torch.cos(torch.arange(1, n + 1, dtype=shapes.dtype, device=shapes.device))
+        image = shapes @ vector
+        unit = (shapes.mT @ (chain.masses * image)[..., None])[..., 0] - vector
+        linear = replace(chain, contact="linear")
+        force = (shapes.mT @ linear.force(image)[..., None])[..., 0] + squared * vector
+        limit = torch.finfo(shapes.dtype).eps ** 0.5
+        good = (unit.abs().amax(-1) <= limit) & (force.abs().amax(-1) <= limit * squared.amax(-1))
+        checks.first_bad("modes", "be those of the chain", unit.abs().amax(-1), ~good, "realization")
+    return modes
+
 
 def normal_modes(chain: Chain) -> NormalModes:
     """Normal modes of the linear (or linearized) chain, checked for residual and orthogonality.
@@ -45,6 +78,7 @@ def normal_modes(chain: Chain) -> NormalModes:
         FieldError: if the chain is damped (its modes are not normal).
         DecompositionError: naming the first realization whose modes fail the check.
     """
+    checks.instance("chain", chain, Chain)
     if chain.is_damped:
         raise checks.fail(
             "damping",

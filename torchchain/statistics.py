@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchchain import checks
+
 
 @dataclass(frozen=True, eq=False)
 class Moments:
@@ -36,7 +38,14 @@ class Moments:
 
 def total_variation(p: Tensor, q: Tensor) -> Tensor:
     """Distance of two distributions over bands, sum over bands of |p - q| / 2, (*batch,) from (*batch, band)."""
-    return (p - q).abs().sum(-1) / 2
+    p, q = checks.real_tensor("p", p), checks.real_tensor("q", q)
+    if p.ndim == 0 or q.ndim == 0 or p.shape[-1] != q.shape[-1]:
+        raise checks.fail("q", f"have the bands of p, shape {tuple(p.shape)}", f"shape {tuple(q.shape)}")
+    try:
+        distance = (p - q).abs().sum(-1) / 2
+    except RuntimeError:
+        raise checks.fail("q", f"fit p of shape {tuple(p.shape)}", f"shape {tuple(q.shape)}") from None
+    return checks.finite("p - q", distance)
 
 
 def statistical_distance(stderr: Tensor) -> Tensor:
@@ -44,6 +53,10 @@ def statistical_distance(stderr: Tensor) -> Tensor:
 
     The difference of two normal means of standard error s has the mean absolute value 2 s / sqrt(pi).
     """
+    checks.instance("stderr", stderr, Tensor)
+    if not stderr.is_floating_point() or stderr.layout != torch.strided or stderr.is_meta or stderr.ndim == 0:
+        raise checks.FieldTypeError(f"stderr must be a dense floating-point tensor (*batch, band), got {stderr.dtype}")
+    checks.first_bad("stderr", "not be negative", stderr, ~(stderr >= 0), "band")  # infinite for one realization
     return stderr.sum(-1) / math.sqrt(math.pi)
 
 

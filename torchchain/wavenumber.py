@@ -10,11 +10,11 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.bands import bin_energy, check_bands
 from torchchain.chain import Chain
-from torchchain.energy import DEFINITIONS, EnergyMatrices, require_linear
+from torchchain.energy import DEFINITIONS, EnergyMatrices, checked, require_linear
 from torchchain.evolvers.method import Trajectory
 from torchchain.evolvers.modes import change_basis, modal_amplitudes
 from torchchain.excitation import State
-from torchchain.spectrum import NormalModes, normal_modes
+from torchchain.spectrum import NormalModes, modes_of, normal_modes
 
 
 def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "site") -> Tensor:
@@ -30,6 +30,7 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
     Returns:
         (*batch, time, N//2 + 1) in the unit of energy.
     """
+    checked(chain, trajectory)
     checks.choice("definition", definition, DEFINITIONS)
     require_linear(chain, "particle_energy, which is defined for every contact law")
     n = chain.n_particles
@@ -53,7 +54,7 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
         energy = (_product(moved, moved) + _product(stretched, stretched)) / 2
     # k and -k are added: twice the value, except where they are one wavenumber.
     energy[..., 1 : (n + 1) // 2] *= 2
-    return energy
+    return checks.finite("energy of trajectory", energy, "wavenumber")
 
 
 def _require_ring(chain: Chain) -> None:
@@ -72,8 +73,11 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
 
 def wavenumber_energy_matrix(matrices: EnergyMatrices) -> Tensor:
     """DFT TE DFT^-1 in full (Eq. 42), complex, (*batch, time, wavenumber, wavenumber), wavenumbers 2 pi (0..N-1) / N."""
-    total = matrices.total
-    n = total.shape[-1]
+    checks.instance("matrices", matrices, EnergyMatrices)
+    total = checks.real_tensor("matrices.total", matrices.total)
+    n = total.shape[-1] if total.ndim > 1 else 0
+    if n == 0 or total.shape[-2] != n:
+        raise checks.fail("matrices.total", "be square on its last axes", f"shape {tuple(total.shape)}")
     index = torch.arange(n, device=total.device)
     angle = (-2 * math.pi / n) * ((index[:, None] * index) % n).to(total.dtype)
     dft = torch.polar(torch.full_like(angle, n**-0.5), angle)
@@ -98,6 +102,8 @@ def band_energy(
     Raises:
         FieldError: if the bands do not divide the tones, or a state to be normalized has no energy.
     """
+    checked(chain, trajectory)
+    checks.truth("normalize", normalize)
     check_bands(chain.n_particles, n_bands)
     energy = wavenumber_energy(chain, trajectory, definition)
     return _normalized(bin_energy(energy, n_bands), energy) if normalize else bin_energy(energy, n_bands)
@@ -146,10 +152,13 @@ def long_time_band_energy(
     Returns:
         (*batch, *any, band).
     """
+    checks.instance("chain", chain, Chain)
+    checks.instance("state", state, State)
+    checks.truth("normalize", normalize)
     check_bands(chain.n_particles, n_bands)
     checks.choice("definition", definition, DEFINITIONS)
     require_linear(chain, "a time average of simulated band energies")
-    modes = normal_modes(chain) if modes is None else modes
+    modes = normal_modes(chain) if modes is None else modes_of(chain, modes)
     displacement, velocity = modal_amplitudes(chain, state, modes)
     frequency = chain.align(modes.frequencies, displacement)
     swing = frequency * displacement
@@ -205,6 +214,6 @@ def basis_fraction(strength: float, n_bands: int) -> Tensor:
     it is 0.55 where Psi is 0.19).
     """
     strength = checks.number("strength", strength, at_least=0)
-    band = torch.arange(1, checks.integer("n_bands", n_bands, 1) + 1, dtype=torch.float64)
+    band = torch.arange(1, checks.integer("n_bands", n_bands, 1, 10**6) + 1, dtype=torch.float64)
     uniform = 1 / n_bands
     return uniform + (1 - uniform) * torch.exp(-((strength * band / 2) ** 1.5))

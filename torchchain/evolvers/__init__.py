@@ -52,6 +52,8 @@ def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **opti
 
 def start(chain: Chain, state: State, method: str, **options: Any) -> Advance:
     """The start of an evolution whose times come in windows; see :class:`Method`."""
+    checks.instance("chain", chain, Chain)
+    checks.instance("state", state, State)
     entry = METHODS[checks.choice("method", method, METHODS)]
     checks.known_keys(f"options of method '{method}'", options, entry.options)
     n = chain.n_particles

@@ -41,6 +41,7 @@ LEAP = 256.0
 SEGMENTS = 1024
 SWEEPS = 8  # of the bound's power iteration: within 2 % of the highest frequency, or of 30 sweeps
 ROUNDING = 2.0**-53
+WASTE = 1e4  # a bound beyond so many times the chain's own is a mistake
 MOST_PHASE = 1e10  # W t, twice the number of stencils
 
 
@@ -124,6 +125,9 @@ def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
         _exceeded(chain, squared),
         "chain",
     )
+    own = WASTE * chain.squared_frequency_bound(SWEEPS).to(torch.float64)
+    rule = f"be at most {WASTE:g} times chain.squared_frequency_bound(): work grows as its root"
+    checks.first_bad("bound", rule, squared, squared > own, "chain")
     return squared
 
 

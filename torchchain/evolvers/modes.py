@@ -12,7 +12,7 @@ from torchchain.chain import Chain
 from torchchain.evolvers import phase
 from torchchain.evolvers.method import Advance, Method, Trajectory
 from torchchain.excitation import State
-from torchchain.spectrum import NormalModes, normal_modes
+from torchchain.spectrum import NormalModes, modes_of, normal_modes
 
 
 def modal_amplitudes(chain: Chain, state: State, modes: NormalModes) -> tuple[Tensor, Tensor]:
@@ -71,7 +71,7 @@ def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Te
 
 def start(chain: Chain, state: State, modes: NormalModes | None = None) -> Advance:
     """See the registry entry below."""
-    modes = normal_modes(chain) if modes is None else modes
+    modes = normal_modes(chain) if modes is None else modes_of(chain, modes)
     motion, back = modal_motion(chain, state, modes), modes.shapes.mT
 
     def advance(times: Tensor) -> Trajectory:

@@ -35,7 +35,7 @@ class AdamSettings:
 
     def __post_init__(self) -> None:
         checks.choice("constraint", self.constraint, CONSTRAINTS)
-        checks.number("penalty", self.penalty, at_least=0)
+        object.__setattr__(self, "penalty", checks.number("penalty", self.penalty, at_least=0, at_most=1e100))
         checks.integer("steps", self.steps, 1, 10**6)
         checks.number("learning_rate", self.learning_rate, above=0, at_most=10)
         checks.number("tolerance", self.tolerance, at_least=0, below=1)

@@ -114,6 +114,7 @@ def _write(header: Mapping[str, Any], tensors: dict[str, torch.Tensor], path: st
         metadata = {"torchchain": json.dumps(header, sort_keys=True, allow_nan=False)}
     except ValueError:  # everything else in the header has been checked
         raise checks.fail("calibration.report", "hold finite numbers", header.get("report")) from None
+    checks.instance("path", path, str, os.PathLike)
     path = Path(path)
     try:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
@@ -140,6 +141,7 @@ def load_family(path: str | Path) -> list[Member]:
 
 
 def _load(path: str | Path, expected: str) -> list[Member]:
+    checks.instance("path", path, str, os.PathLike)
     path = Path(path)
     where = f"file {path}"
     try:

@@ -111,6 +111,7 @@ def calibrate(
     Warns:
         FitWarning: naming how many entries of the nonlinear fit did not converge, or that Adam did not.
     """
+    checks.instance("transfer", transfer, BandTransfer)
     held = transfer.long_time is not None
     asked = recipe(transfer.scene, method, model, window, held, **settings)
     replicates = _replicates(bootstrap, asked.method, transfer)

@@ -62,7 +62,10 @@ def chapman_kolmogorov(
     Raises:
         FieldError: if the transfer holds no such time.
     """
+    checks.instance("transfer", transfer, BandTransfer)
     lag = checks.number("lag", lag, above=0)
+    if not checks.is_collection(multiples):
+        raise checks.FieldTypeError(f"multiples must be integers, got {checks.shown(multiples)}")
     numbers = [checks.integer("multiples", n, 1) for n in multiples]
     if not numbers or any(b <= a for a, b in pairwise(numbers)):
         raise checks.fail("multiples", "be increasing", numbers)
@@ -91,6 +94,7 @@ def implied_timescales(transfer: BandTransfer, lags: Any) -> tuple[Tensor, Tenso
         timescales and standard errors, (lag, band - 1): the eigenvalue 1 of conserved energy is left out; infinite
         where noise has carried an eigenvalue to 1 or beyond.
     """
+    checks.instance("transfer", transfer, BandTransfer)
     lags = checks.times("lags", lags)
     places = [_at("lags", transfer, float(lag)) for lag in lags]
     checks.first_bad("lags", "be above 0", lags, lags <= 0)

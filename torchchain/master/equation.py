@@ -55,6 +55,9 @@ class MasterEquation(nn.Module):
 
     def __init__(self, model: TransferModel, calibration: Calibration, uncertainty: Uncertainty | None = None) -> None:
         super().__init__()
+        checks.instance("model", model, TransferModel)
+        checks.instance("calibration", calibration, Calibration, type(None))
+        checks.instance("uncertainty", uncertainty, Uncertainty, type(None))
         self.model = model
         self.calibration = calibration
         self.uncertainty = uncertainty
@@ -196,6 +199,7 @@ class MasterEquation(nn.Module):
         Bands and boundary cannot be changed afterwards; disorder within 1e-9 only, unless the model is one of a range of
         strengths. The chain's length may change where the wave has not yet gone round: the rates belong to bands, not to tones.
         """
+        checks.instance("scene", scene, Scene)
         own, found = self.calibration.scene, []
         for name, label in (
             ("n_bands", "bands"),

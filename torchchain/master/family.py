@@ -41,8 +41,13 @@ class MasterFamily:
     """
 
     def __init__(self, members: Sequence[MasterEquation]) -> None:
+        if not isinstance(members, (list, tuple)):
+            raise checks.FieldTypeError(f"members must be a list of master equations, got {checks.shown(members)}")
         if not members:
             raise checks.fail("members", "be at least one master equation", 0)
+        for member in members:
+            checks.instance("members", member, MasterEquation)
+            checks.instance("members' calibration", member.calibration, Calibration)
         self.members = tuple(sorted(members, key=lambda member: member.calibration.scene.disorder.strength))
         first = self.members[0].calibration.scene
         for member in self.members:
@@ -153,6 +158,10 @@ def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> Mast
         transfers: of ensembles that differ in the strength of their disorder (and in seeds, realizations and times).
         settings: of :func:`torchchain.calibrate`, but method and model.
     """
+    if not isinstance(transfers, (list, tuple)) or not transfers:
+        raise checks.FieldTypeError(f"transfers must be a list of band transfers, got {checks.shown(transfers)}")
+    for transfer in transfers:
+        checks.instance("transfers", transfer, BandTransfer)
     return MasterFamily([calibrate(transfer, "projection", "memory", **settings) for transfer in transfers])
 
 

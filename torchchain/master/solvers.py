@@ -94,7 +94,8 @@ def _ode(method: str) -> Callable[..., Tensor]:
         elif adaptive:  # steps end at the output times: between them the solution is known to a lower order only
             options = {"norm": largest_over_members, "max_num_steps": MOST_STEPS}
         else:
-            options = {"step_size": _checked_step(method, parts.generator, step, float(times[-1]))}
+            # Between steps by cubics: torchdiffeq's straight lines would make every method one of second order.
+            options = {"step_size": _checked_step(method, parts.generator, step, float(times[-1])), "interp": "cubic"}
             if method.endswith("adams"):
                 options |= {"max_order": ADAMS_STEPS, "max_iters": ADAMS_ITERATIONS}
 

@@ -61,7 +61,8 @@ class Uncertainty:
         low, high = kept[after - 1], kept[after]
         weight = ((times - low) / (high - low)).clamp(0, 1)[:, None]
         here = stderr[:, after - 1] * (1 - weight) + stderr[:, after] * weight
-        return torch.einsum("...s,str->...tr", initial.square(), here.square()).sqrt()
+        size = initial.abs().amax(-1, keepdim=True).clamp(min=torch.finfo(initial.dtype).tiny)
+        return torch.einsum("...s,str->...tr", (initial / size).square(), here.square()).sqrt() * size[..., None]
 
     def tensors(self) -> dict[str, Tensor]:
         return {
