@@ -160,6 +160,8 @@ def _costs(ax: Axes, data: xarray.Dataset) -> None:
                 va="top", ha="right", color="0.4", fontsize="small")  # fmt: skip
     ax.set(xscale="log", yscale="log", xlabel="seconds of the calibration", ylabel="total variation from fresh chains",
            title=f"(b) error and calibration, B = {shown}")  # fmt: skip
+    for label in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+        label("{x:g}")
 
 
 def _predictions(ax: Axes, data: xarray.Dataset) -> None:

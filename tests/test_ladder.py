@@ -8,6 +8,7 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 import torch
+import xarray
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
@@ -515,3 +516,31 @@ def test_families_refuse(family):
     plain = tc.MasterEquation(tc.RateModel(EYE * 0, EYE), family.members[0].calibration)
     with pytest.raises(FieldError, match="members must have the model 'memory'"):
         MasterFamily([plain])
+
+
+def test_families_from_the_command_line(family, tmp_path, capsys):
+    from torchchain.cli import main
+
+    files = []
+    for member in family.members:
+        files.append(str(tmp_path / f"{member.calibration.scene.disorder.strength}.safetensors"))
+        member.save(files[-1])
+    out = tmp_path / "family"
+    assert main(["family", *files, "--out", str(out)]) == 0
+    assert "calibrated at 0.1, 0.2, 0.3, 0.4" in capsys.readouterr().out
+    model, predicted = str(out / "model.safetensors"), tmp_path / "predicted"
+    assert main(["predict", model, "--strength", "0.25", "--out", str(predicted)]) == 0
+    with xarray.open_dataset(predicted / "results.nc", engine="h5netcdf") as data:
+        expected = family.solve(EYE, np.array(data.time), 0.25)
+        assert np.array_equal(data.band_energy.values, expected.numpy())
+        assert (data.band_energy_stderr.values >= 0).all()
+    for wrong, message in (
+        ([model], "must carry the format torchchain-master-equation"),
+        ([model, "--strength", "0.5"], "strength must be at most 0.4"),
+        ([files[0], "--strength", "0.1"], "must carry the format torchchain-master-family"),
+    ):
+        assert main(["predict", *wrong, "--out", str(tmp_path / "none")]) == 2
+        assert message in capsys.readouterr().err
+    assert main(["family", files[0], files[0], "--out", str(tmp_path / "none")]) == 2
+    assert "different strengths" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
