@@ -570,12 +570,18 @@ def _curves(ax: Axes, data: xarray.Dataset) -> None:
         one = data.isel(edge=(data.method.values == method) & (data.quantity.values == quantity)).isel(edge=0)
         values = np.clip(np.nan_to_num(one.badness.values, nan=1e12, posinf=1e12), 1e-14, 1e12)
         values = np.where(np.isnan(one.badness.values) & (one.relative.values < 1), np.nan, values)
-        ax.plot(one.relative, values, marker=".", color=f"C{i}", label=f"{method}: {quantity}")
+        ax.plot(
+            one.relative,
+            values,
+            marker=".",
+            color=f"C{i}",
+            label=f"{method}, {quantity}" if "step" in quantity else method,
+        )
     ax.axhline(1, color="k", linewidth=0.8)
     ax.axvline(1, color="k", linewidth=0.8, linestyle=":")
     ax.set(yscale="log", ylim=(1e-14, 3e12), xlabel="value / predicted edge", ylabel="what goes wrong / what is allowed",
            title="(b) beyond the edge, without the guards")  # fmt: skip
-    ax.legend(fontsize=8, loc="upper left")
+    ax.legend(fontsize=8, loc="lower right")
 
 
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:

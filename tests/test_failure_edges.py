@@ -109,6 +109,16 @@ def test_tolerances_below_rounding_are_refused(method):
     assert (solved - exact).abs().max() < 100 * 16 * eps, "a hundred steps, each within the default tolerance"
 
 
+@pytest.mark.parametrize(("method", "order"), [("heun3", 3), ("rk4", 4)])
+def test_outputs_between_steps_keep_the_order(method, order):
+    master = equation(tensor(PAIRS))
+    times = torch.linspace(0, 7, 50, dtype=torch.float64)  # no multiples of the steps
+    exact = master.solve(first(3), times)
+    errors = [(master.solve(first(3), times, method, step=step) - exact).abs().max() for step in (0.2, 0.1, 0.05)]
+    for coarse, fine in zip(errors[:-1], errors[1:], strict=True):
+        assert math.log2(coarse / fine) == pytest.approx(order, abs=0.35)
+
+
 @pytest.mark.parametrize("method", ["expm", "dopri5", "rk4"])
 def test_energy_that_grows_beyond_all_numbers(method):
     rates = (tensor(PAIRS) + 0.5 * torch.eye(3)).float()

@@ -1,7 +1,6 @@
 """Anything at all as any argument of any public function: a typed error that names it, or a finite answer, soon."""
 
 import dataclasses
-import inspect
 import math
 import time
 import warnings
@@ -17,15 +16,15 @@ from hypothesis import strategies as st
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
+from torchchain.evolvers import ode
 from torchchain.evolvers.drift import EnergyDriftError
 from torchchain.machine import Machine
 from torchchain.master import IntegrationError
-from torchchain.master.equation import Calibration
 from torchchain.spectrum import DecompositionError
 
 SOON = 10.0
 """Seconds of an answer, on a machine busy with other things; a second where it is not."""
-FAILED = (DecompositionError, EnergyDriftError, IntegrationError)
+FAILED = (DecompositionError, EnergyDriftError, IntegrationError, ode.IntegrationError)
 """Solvers that say which check a result of theirs has not passed."""
 
 settings.register_profile(
@@ -78,11 +77,6 @@ def family():
     return tc.calibrate_family([transfer(xi) for xi in (0.1, 0.2, 0.3)], order=(1, 0), bootstrap=2)
 
 
-def record(**changes):
-    """A calibration's record: what of it a hostile value replaces."""
-    return dataclasses.replace(master().calibration, **changes)
-
-
 def memory():
     return {name: value.detach() for name, value in master().model.tensors().items()}
 
@@ -106,11 +100,14 @@ class Call:
     def arguments(self):
         return self.given() if callable(self.given) else dict(self.given)
 
+    def given_names(self):
+        return sorted(self.arguments())
 
-DISORDER = {name: ("disorder",) for name in ("kind", "strength", "lower")}
+
+DISORDER = dict.fromkeys(("kind", "strength", "lower"), ("disorder",))
 RUN = {"device": "cpu", "memory_budget": None, "options": None}
 CALLS = {
-    "BandTransfer": Call(tc.BandTransfer, lambda: {f.name: getattr(transfer(), f.name) for f in dataclasses.fields(tc.BandTransfer)}),
+    "BandTransfer": Call(tc.BandTransfer, lambda: {f.name: getattr(transfer(), f.name) for f in dataclasses.fields(tc.BandTransfer)}, {"times": ("mean",), "block_counts": ("block_mean",), "scene": ("mean",)}, infinite=True),
     "Chain": Call(tc.Chain, {"masses": [[1.0, 2.0, 1.0]], "boundary": "fixed", "stiffness": 1.0, "contact": "linear", "damping": 0.0}),
     "Disorder": Call(tc.Disorder, {"kind": "gamma", "strength": 0.3, "lower": 0.05}, DISORDER),
     "Disorder.masses": Call(lambda **k: tc.Disorder().masses(**k), {"n_particles": 4, "realizations": 2, "seed": 0}),
@@ -130,14 +127,14 @@ CALLS = {
     "MasterFamily.solve": Call(lambda **k: family().solve(**k), {"initial": START, "times": TIMES, "strength": 0.15, "method": "expm"}),
     "MasterFamily.leave_one_out": Call(lambda **k: family().leave_one_out(**k), {"times": TIMES}),
     "MemoryModel": Call(tc.MemoryModel, memory, {"pair_frequency": ("amplitudes",), "decay": ("amplitudes",), "pair_decay": ("amplitudes",), "basis": ("amplitudes",), "rates": ("basis", "amplitudes")}),
-    "NormalModes": Call(lambda **k: tc.evolve(chain(), state(), TIMES, "modes", modes=tc.NormalModes(**k)), lambda: {"frequencies": tc.normal_modes(chain()).frequencies, "shapes": tc.normal_modes(chain()).shapes}),
+    "NormalModes": Call(lambda **k: tc.evolve(chain(), state(), TIMES, "modes", modes=tc.NormalModes(**k)), lambda: {"frequencies": tc.normal_modes(chain()).frequencies, "shapes": tc.normal_modes(chain()).shapes}, {"frequencies": ("modes", "times"), "shapes": ("modes",)}),
     "RateModel": Call(tc.RateModel, {"rates": 0 * EYE, "basis": EYE, "damping": 0 * START}, {"rates": ("basis", "damping")}),
-    "Scaling": Call(tc.Scaling, {"radius": 0.01, "density": 7800.0, "young_modulus": 2e11, "poisson_ratio": 0.3, "force": 10.0}, {n: ("si",) for n in ("radius", "density", "young_modulus", "poisson_ratio")}),
+    "Scaling": Call(tc.Scaling, {"radius": 0.01, "density": 7800.0, "young_modulus": 2e11, "poisson_ratio": 0.3, "force": 10.0}, dict.fromkeys(("radius", "density", "young_modulus", "poisson_ratio"), ("si",))),
     "Scene": Call(tc.Scene, lambda: {f.name: getattr(scene(), f.name) for f in dataclasses.fields(tc.Scene)}, {"n_particles": ("n_bands", "excitation"), "damping": ("observables",)}),
     "SwingInModel": Call(tc.SwingInModel, {"rates": 0 * EYE, "basis": EYE, "delay": 1.0, "damping": 0 * START}, {"rates": ("basis", "damping", "delay")}),
     "StandingWave": Call(tc.StandingWave, {"tones": (1, 2), "amplitude": 0.01, "phase": "sin"}),
     "State": Call(tc.State, {"displacement": [0.0, 1.0], "velocity": [0.0, 0.0]}, {"displacement": ("velocity",)}),
-    "Trajectory": Call(lambda **k: tc.total_energy(chain(), tc.Trajectory(**k)), lambda: {"times": trajectory().times, "displacement": trajectory().displacement, "velocity": trajectory().velocity}, {"times": ("displacement", "velocity", "trajectory"), "displacement": ("velocity", "trajectory"), "velocity": ("trajectory",)}),
+    "Trajectory": Call(lambda **k: tc.total_energy(chain(), tc.Trajectory(**k)), lambda: {"times": trajectory().times, "displacement": trajectory().displacement, "velocity": trajectory().velocity}, {"displacement": ("trajectory",), "velocity": ("trajectory",)}),
     "band_energy": Call(tc.band_energy, lambda: {"chain": chain(), "trajectory": trajectory(), "n_bands": 2, "normalize": True, "definition": "site"}),
     "band_transfer": Call(tc.band_transfer, lambda: {"scene": scene(realizations=2), "method": "modes", "long_time": True, **RUN, "checkpoint": None}),
     "basis_fraction": Call(tc.basis_fraction, {"strength": 0.3, "n_bands": 4}),
@@ -166,11 +163,11 @@ CALLS = {
     "lyapunov_exponent": Call(tc.lyapunov_exponent, {"disorder": tc.Disorder(), "frequencies": [0.5], "n_particles": 8, "realizations": 2, "seed": 0, "stiffness_disorder": None}),
     "normal_modes": Call(tc.normal_modes, lambda: {"chain": chain()}),
     "particle_energy": Call(tc.particle_energy, lambda: {"chain": chain(), "trajectory": trajectory(), "definition": "bond"}),
-    "plan": Call(tc.plan, lambda: {"scene": scene(), "machine": MACHINE, "artifact": None}, infinite=True),
+    "plan": Call(tc.plan, lambda: {"scene": scene(), "machine": MACHINE, "artifact": None}, {"artifact": ("file",)}, infinite=True),
     "potential_energy": Call(tc.potential_energy, lambda: {"chain": chain(), "trajectory": trajectory(), "definition": "site"}),
     "simulate": Call(tc.simulate, lambda: {"scene": scene(realizations=2), "method": "modes", **RUN, "checkpoint": None}),
     "standing_wave": Call(tc.standing_wave, lambda: {"chain": chain(), "tone": 1, "amplitude": 0.01, "phase": "sin"}),
-    "statistical_distance": Call(tc.statistical_distance, {"stderr": ENERGY}),
+    "statistical_distance": Call(tc.statistical_distance, {"stderr": ENERGY}, infinite=True),
     "total_energy": Call(tc.total_energy, lambda: {"chain": chain(), "trajectory": trajectory()}),
     "total_variation": Call(tc.total_variation, {"p": START, "q": START}, {"p": ("q",), "q": ("p",)}),
     "wavenumber_energy": Call(tc.wavenumber_energy, lambda: {"chain": chain(), "trajectory": trajectory(), "definition": "site"}),
@@ -221,7 +218,7 @@ VALUES = {
     "2.5": 2.5, "-2.5": -2.5, "1e-300": 1e-300, "1e300": 1e300, "-1e300": -1e300, "5e-324": 5e-324, "2^31": 2**31, "2^63": 2**63, "2^64": 2**64,
     "-2^63": -(2**63), "10^400": 10**400, "a line\nmore": "a line\nmore", "list": [], "tuple": (), "dict": {}, "set": {1.0}, "nested": [[]],
     "ragged": [[1.0], [1.0, 2.0]], "words": ["a", "b"], "nones": [None, 1.0], "nans": [math.nan, 1.0], "huge ones": [10**400, 1],
-    "table": {"a": 1}, "range": range(3), "generator": iter([1.0]), "numpy text": np.array(["a"]), "numpy objects": np.array([Odd()]),
+    "table": {"a": 1}, "range": range(3), "iterator": iter([]), "numpy text": np.array(["a"]), "numpy objects": np.array([Odd()]),
     "numpy complex": np.ones(4) * 1j, "numpy float16": np.float16(1), "numpy int": np.int64(-3), "numpy nan": np.array([np.nan]), "path": Path("nothing/here"),
     "dates": np.array(["2020-01-01"], dtype="datetime64[D]"),
     "integers": torch.ones(4, dtype=torch.int64), "truths": torch.ones(4, dtype=torch.bool), "complexes": torch.ones(4, dtype=torch.complex128),
@@ -286,3 +283,119 @@ def verdict(name, argument, value):
                     return f"{way} is not finite"
     spent = time.perf_counter() - begin
     return f"it took {spent:.1f} s" if spent > SOON else None
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_every_value_as_every_argument(name):
+    found = {
+        f"{argument} = {label}": bad
+        for argument in CALLS[name].arguments()
+        for label, value in VALUES.items()
+        if (bad := verdict(name, argument, value))
+    }
+    assert not found
+
+
+def test_the_cases_are_many():
+    assert sum(len(call.arguments()) for call in CALLS.values()) * len(VALUES) > 15_000
+
+
+DTYPES = st.sampled_from([torch.float64, torch.float32, torch.float16, torch.int64, torch.bool, torch.complex64])
+FLOATS = st.floats() | st.sampled_from([0.0, -0.0, 5e-324, 1e-300, 1e300, -1e300, math.nan, math.inf])
+ARRAYS = st.builds(
+    lambda shape, dtype, value, last: torch.cat(
+        [torch.full(shape, value, dtype=torch.float64), torch.full((*shape[:-1], 1), last, dtype=torch.float64)], -1
+    ).to(dtype),
+    st.lists(st.integers(0, 5), min_size=1, max_size=4),
+    DTYPES,
+    FLOATS,
+    FLOATS,
+)
+ANYTHING = st.recursive(
+    FLOATS | st.integers() | st.booleans() | st.none() | st.text(max_size=5) | st.binary(max_size=5) | st.complex_numbers(),
+    lambda inner: st.lists(inner, max_size=5) | st.tuples(inner, inner) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
+    max_leaves=6,
+)  # fmt: skip
+PLACES = [(name, argument) for name, call in CALLS.items() for argument in call.given_names()]
+
+
+@settings(max_examples=1500)
+@given(st.sampled_from(PLACES), ANYTHING | ARRAYS)
+def test_anything_as_any_argument(place, value):
+    assert verdict(*place, value) is None
+
+
+@settings(max_examples=200)
+@given(st.sampled_from(sorted(CALLS)), st.text(min_size=1, max_size=8))
+def test_arguments_that_are_not_there_and_some_too_many(name, word):
+    """Python's own TypeError for a missing argument or one of an unknown name; a typed error that names an option."""
+    arguments = CALLS[name].arguments()
+    if word not in arguments:
+        with pytest.raises((TypeError, FieldError)) as caught:
+            CALLS[name].of(**arguments, **{word: 1})
+        assert word in str(caught.value) or repr(word)[1:-1] in str(caught.value)
+
+
+# Extremes that have an answer have the right one
+
+
+SIZES = [1e-300, 1e-150, 1.0, 1e150, 1e300]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_centers_do_not_depend_on_the_unit_of_energy(size):
+    expected = tc.energy_center(ENERGY)
+    torch.testing.assert_close(tc.energy_center(size * ENERGY), expected, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_predictions_are_linear_in_the_start(size):
+    for solved in (master().solve, master().standard_error, rates_alone().dissipated):
+        expected = solved(START, TIMES)
+        torch.testing.assert_close(solved(size * START, TIMES) / size, expected, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e-100, 1e100, 1e200])
+def test_frequencies_scale_with_the_masses(size):
+    expected = tc.normal_modes(chain()).frequencies
+    found = tc.normal_modes(tc.Chain(size * chain().masses)).frequencies
+    torch.testing.assert_close(found * size**0.5, expected, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("time", [5e-324, 1e-300, 1e-20])
+def test_at_once_nothing_has_moved(time):
+    still = tc.evolve(chain(), state(), [time]).displacement[..., 0, :]
+    torch.testing.assert_close(still, state().displacement, rtol=0, atol=1e-16)
+    torch.testing.assert_close(master().solve(START, [time])[0], START, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-60, 1e-30, 1e30, 1e60])
+def test_shares_of_the_energy_do_not_depend_on_the_amplitude(size):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        wave = tc.evolve(chain(), tc.standing_wave(chain(), 1, size), TIMES)
+    expected = tc.band_energy(chain(), trajectory(), 2)
+    torch.testing.assert_close(tc.band_energy(chain(), wave, 2), expected, rtol=1e-11, atol=1e-13)
+
+
+# What takes too much memory is refused before it is taken
+
+
+HUGE = [
+    (lambda: tc.simulate(tc.Scene(n_particles=10**6, n_bands=1, realizations=1), "modes"), "n_particles"),
+    (lambda: tc.simulate(tc.Scene(n_particles=10**8, times=np.arange(10**4), observables=["energy"], excitation=tc.Impulse())), "observables"),
+    (lambda: tc.band_transfer(tc.Scene(n_particles=10**6, n_bands=50_000, realizations=1, times=np.arange(100)), "chebyshev", long_time=False), "observables"),
+    (lambda: tc.Disorder().masses(10**8, 10**6, 0), "realizations"),
+    (lambda: tc.Disorder().stiffnesses(10**8, range(10**5), 0), "realizations"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "field"), HUGE)
+def test_what_cannot_fit_is_refused_with_the_estimate(call, field):
+    begin = time.perf_counter()
+    with pytest.raises(
+        FieldError, match=rf"{field} must (need|take) at most the .* GB of memory .*: about .* GB"
+    ) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    assert time.perf_counter() - begin < SOON

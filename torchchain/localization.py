@@ -50,7 +50,8 @@ def lyapunov_exponent(
     checks.instance("disorder", disorder, Disorder)
     checks.instance("stiffness_disorder", stiffness_disorder, Disorder, type(None))
     w = checks.real_tensor("frequencies", frequencies).to(torch.float64)
-    checks.first_bad("frequencies", "lie between 0 and 1e100", w, (w < 0) | (w > 1e100))
+    checks.first_bad("frequencies", "not be negative", w, w < 0)
+    checks.first_bad("frequencies", "be at most 1e100", w, w > 1e100)
     if w.ndim != 1:
         raise checks.fail("frequencies", "be one-dimensional", f"shape {tuple(w.shape)}")
     realizations = checks.integer("realizations", realizations, 2)

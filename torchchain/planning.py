@@ -133,8 +133,6 @@ def plan(scene: Scene, machine: Machine | None = None, artifact: str | Path | Ma
     """
     checks.instance("scene", scene, Scene)
     checks.instance("machine", machine, Machine, type(None))
-    if artifact is not None and type(artifact).__name__ != "MasterEquation":
-        checks.instance("artifact", artifact, str, Path)
     machine = machine or this_machine()
     with single_thread():
         return _plan(scene, machine, artifact)
@@ -279,6 +277,7 @@ def _stand_in(scene: Scene, artifact: str | Path | MasterEquation, tolerance: fl
     from torchchain import coverage
     from torchchain.master import MasterEquation
 
+    checks.instance("artifact", artifact, str, Path, MasterEquation)
     master = artifact if isinstance(artifact, MasterEquation) else MasterEquation.load(artifact)
     missing = coverage.gaps(master, scene)
     if missing:
@@ -296,6 +295,8 @@ def _stand_in(scene: Scene, artifact: str | Path | MasterEquation, tolerance: fl
 
 
 def _method_reasons(best: Choice, good: list[Choice], facts: Facts, machine: Machine) -> list[str]:
+    from torchchain.ensemble import layout
+
     reasons = [] if best.method == ARTIFACT else [f"'{best.method}': {METHODS[best.method].summary}"]
     if len(good) > 1:
         ratio = good[1].predicted_seconds / max(best.predicted_seconds, 1e-12)
@@ -307,6 +308,9 @@ def _method_reasons(best: Choice, good: list[Choice], facts: Facts, machine: Mac
     if facts.reach is not None:
         n, whole = facts.n, facts.scene.n_particles
         reasons.append(f"the wave reaches {n} of {whole} particles by the last time: the others are left out")
+    if best.method != ARTIFACT:
+        cut = layout(facts.scene, best.method, facts.scene.observables, torch.device("cpu"))
+        reasons.append(f"chains {facts.chains}, in chunks of {min(cut.size, facts.chains)}, {cut.workers} side by side")
     if machine.compilation and best.method not in ("chebyshev", "verlet", "symplectic4"):
         reasons.append(f"compiling the stencil's kernels first would take about {machine.compilation:.0f} s")
     return reasons

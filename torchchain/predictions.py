@@ -177,7 +177,7 @@ def _step_error(method: str, facts: Facts) -> float:
     """
     order, constant, _, _ = STEPPERS[method]
     if facts.scene.observables == ("total_energy",) and facts.scene.damping == 0:
-        return 12 * constant * facts.frequency(order)
+        return 18 * constant * facts.frequency(order)
     margin = 5 if "displacement" in facts.scene.observables else 3
     return margin * constant * facts.frequency(order + 1) * max(facts.growing, 1.0)
 

@@ -131,7 +131,8 @@ def check_limits(step: float, method: str, rates: Sequence[tuple[str, float | No
 def substeps(now: float, times: list[float], step: Tensor | float) -> np.ndarray:
     """How many equal steps of at most ``step`` (*any,) lead from each time to the next, the first from ``now``, (*any, time)."""
     spans = np.diff(times, prepend=now)
-    ratio = spans / torch.as_tensor(step, dtype=torch.float64).cpu().numpy()[..., None]
+    with np.errstate(over="ignore"):
+        ratio = spans / torch.as_tensor(step, dtype=torch.float64).cpu().numpy()[..., None]
     if not ratio.max() <= MOST_STEPS:
         where = tuple(int(i) for i in np.argwhere(ratio == ratio.max())[0])
         raise checks.fail(
