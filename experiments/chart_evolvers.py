@@ -327,6 +327,7 @@ def _panel(ax: Axes, part: xarray.Dataset, cost: str, title: str, floor: float) 
     ax.axhline(floor, color="k", linestyle="--", linewidth=0.8)
     ax.set(xscale="log", yscale="log", title=title, ylim=(1e-15, 3))
     ax.title.set_fontsize("medium")
+    ax.xaxis.set_minor_formatter("")
 
 
 def best(part: xarray.Dataset, accuracy: float) -> xarray.Dataset | None:

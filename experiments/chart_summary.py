@@ -189,7 +189,7 @@ def markdown(data: xarray.Dataset, config: Config) -> str:
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(2, 2, width=6.6, height=4.2)
+    figure, axes = harness.panels(2, 2, width=5.8, height=4.6)
     accuracy = config.accuracies[len(config.accuracies) // 2]
     _dots(axes[0, 0], data, "evolver", accuracy, f"(a) evolving one chain to error {accuracy:.0e}")
     _dots(axes[0, 1], data, "solver", accuracy, f"(b) solving the master equation to error {accuracy:.0e}")
@@ -217,9 +217,9 @@ def _dots(ax: Axes, data: xarray.Dataset, axis: str, accuracy: float, title: str
                 label=method,
             )
     ax.set_yticks(range(len(scenes)), scenes, fontsize="small")
-    ax.set(xscale="log", xlabel="seconds, fastest setting", title=title, ylim=(-0.6, len(scenes) - 0.4))
+    ax.set(xscale="log", xlabel="processor seconds, fastest setting", title=title, ylim=(-0.6, len(scenes) - 0.4))
     ax.grid(axis="y", alpha=0.3)
-    ax.legend(fontsize=7, ncols=1, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    ax.legend(fontsize=7, ncols=5, loc="upper center", bbox_to_anchor=(0.4, -0.14))
 
 
 def _model_panel(ax: Axes, data: xarray.Dataset) -> None:
@@ -235,7 +235,7 @@ def _model_panel(ax: Axes, data: xarray.Dataset) -> None:
     ax.set_xticks(bands, [str(b) for b in bands])
     ax.yaxis.set_major_formatter("{x:g}")
     ax.minorticks_off()
-    ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    ax.legend(fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
 
 
 def _way_panel(ax: Axes, data: xarray.Dataset) -> None:
@@ -243,12 +243,12 @@ def _way_panel(ax: Axes, data: xarray.Dataset) -> None:
     ax.barh(order + 0.2, data.way_work, 0.35, color="C0", label="chains evolved")
     ax.barh(order - 0.2, data.way_seconds, 0.35, color="C1", label="seconds")
     names = [
-        f"{o.partition(':')[0]}: {n}" for o, n in zip(data.way_observable.values, data.way_name.values, strict=True)
+        f"{o.partition(':')[0]}:\n{n}" for o, n in zip(data.way_observable.values, data.way_name.values, strict=True)
     ]
     ax.set_yticks(order, names, fontsize="small")
     ax.axvline(1, color="k", linewidth=0.8)
     ax.set(xlabel="cost of the same error, plain realizations = 1", title="(d) averaging over the ensemble")
-    ax.legend(fontsize="small", loc="lower right")
+    ax.legend(fontsize="small", loc="upper right")
 
 
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:

@@ -209,6 +209,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     kept.set(
         xlabel="kills of a run so far (last: done)", ylabel="realizations kept", title="every run comes to its end"
     )
+    kept.xaxis.get_major_locator().set_params(integer=True)
     kept.legend(fontsize="small")
     return figure
 
@@ -217,8 +218,9 @@ def explain(data: xarray.Dataset, config: Config) -> str:
     return (
         "Each run is killed at a random moment and the same command given again, until it is done; then all data are\n"
         "compared with those of a run that nothing disturbed. What a kill loses is what came after the last save: the time\n"
-        "between saves and a chunk, and at the start of a process reading its flags. The moments of the kills are random in\n"
-        "time: another machine kills elsewhere."
+        "between saves and a chunk; in calibrate also the fit, which is made anew from the finished ensemble. The moments of\n"
+        "the kills are random in time: another machine kills elsewhere. A line that falls to 0 was killed between its results and\n"
+        "its end: the results are there, the checkpoint is gone, and the command makes them anew."
     )
 
 

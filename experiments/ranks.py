@@ -166,9 +166,7 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
 def draw(data: xarray.Dataset, config: Config) -> Figure:
     figure, axes = harness.panels(1, 2)
     place = np.arange(data.sizes["way"])
-    for ax, kind, label in zip(
-        axes[0], ("seconds", "cpu_seconds"), ("seconds", "CPU seconds of all processes"), strict=True
-    ):
+    for ax, kind, label in zip(axes[0], ("seconds", "cpu_seconds"), ("seconds", "CPU seconds in all"), strict=True):
         for m, method in enumerate(METHODS):
             values = data[kind].sel({"method": method})
             ratio = values.isel(way=0) / values if kind == "seconds" else values / values.isel(way=0)
@@ -178,7 +176,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
             for repeat in range(data.sizes["repeat"]):
                 ax.plot(place + 0.4 * m - 0.2, relative[:, repeat], "k.", ms=3)
         ax.set_xticks(place, [str(way).replace(", ", ",\n") for way in data.way.values])
-        ax.set(ylabel=f"{label}, relative to one thread")
+        ax.set(ylabel="times faster than one thread" if kind == "seconds" else f"{label}, relative to one thread")
     axes[0, 0].axhline(2, color="k", ls=":", lw=1)
     axes[0, 0].set(title="times faster (dots: single runs)", ylim=(0, 2.4))
     axes[0, 1].set(title="work done in all")
