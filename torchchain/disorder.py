@@ -71,7 +71,9 @@ class Disorder:
 
     def stiffnesses(self, n_contacts: int, realizations: int | Iterable[int], seed: int) -> Tensor:
         """Contact stiffnesses in units of the mean stiffness, (realization, contact), independent of the masses."""
-        return self._sample(checks.integer("n_contacts", n_contacts, 1, LARGEST_CHAIN + 1), realizations, seed, _STIFFNESSES)
+        return self._sample(
+            checks.integer("n_contacts", n_contacts, 1, LARGEST_CHAIN + 1), realizations, seed, _STIFFNESSES
+        )
 
     def _sample(self, size: int, realizations: int | Iterable[int], seed: int, stream: int) -> Tensor:
         seed = checks.integer("seed", seed, 0, 2**64 - 1)

@@ -36,7 +36,9 @@ def kinetic_energy(chain: Chain, trajectory: Trajectory) -> Tensor:
     """Kinetic energy of every particle (Eq. 30), (*batch, time, particle)."""
     checked(chain, trajectory)
     velocity = trajectory.velocity
-    return checks.finite("energy of trajectory", chain.align(chain.masses, velocity) * velocity.square() / 2, "particle")
+    return checks.finite(
+        "energy of trajectory", chain.align(chain.masses, velocity) * velocity.square() / 2, "particle"
+    )
 
 
 def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "site") -> Tensor:

@@ -745,7 +745,9 @@ class BandTransfer:
         late = ("long_time", "long_time_stderr", "block_long_time") if "long_time" in data else ()
         for name in (*needed, *late):
             if name not in data:
-                raise checks.fail("data", f"hold the variable {name} of a band transfer", f"{', '.join(map(str, data))}")
+                raise checks.fail(
+                    "data", f"hold the variable {name} of a band transfer", f"{', '.join(map(str, data))}"
+                )
         for name in ("scene", "mass_mean", "mass_sd"):
             if name not in data.attrs:
                 raise checks.fail("data", f"have the attribute {name} of a band transfer", "none")

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchchain import checks
+from torchchain.excitation import StandingWave
 from torchchain.master import artifact
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
@@ -244,6 +245,7 @@ class MasterEquation(nn.Module):
             tensors[name] = joined.T / size @ tensors[name] @ joined
         tensors["damping"] = tensors["damping"] @ joined / size
         scene = self.calibration.scene
+        assert isinstance(scene.excitation, StandingWave), "transfers come from standing waves"
         scene = replace(scene, n_bands=n_bands, excitation=replace(scene.excitation, tones=None))
         report = {"coarsened_from": self.n_bands, "horizon": self._report.get("horizon", "infinite")}
         return MasterEquation(MemoryModel(**tensors), replace(self.calibration, scene=scene, report=report))
