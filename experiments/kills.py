@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
+import multiprocessing
 import os
-import signal
 import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import harness
@@ -59,33 +58,31 @@ def arguments(config: Config, command: str, out: Path) -> list[str]:
     return [command, *(str(word) for pair in flags.items() for word in pair)]
 
 
-def begun(command: list[str]) -> int:
-    """The command in a process of its own, forked from this one so that it need not load the libraries again."""
-    child = os.fork()
-    if child:
-        return child
-    status = 99
-    try:
-        silent = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(silent, 1)
-        os.dup2(silent, 2)
-        status = cli.main(command)
-    finally:
-        os._exit(status)
+SERVER = multiprocessing.get_context("forkserver")  # forks processes that hold the libraries already
+SERVER.set_forkserver_preload(["torchchain.commands", "torchchain.evolvers.stencil", "__main__"])
 
 
-def ended(child: int, seconds: float) -> bool:
+def _run(command: list[str]) -> None:
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    torch.set_num_threads(1)
+    os._exit(cli.main(command))
+
+
+def begun(command: list[str]) -> BaseProcess:
+    """The command in a process of its own."""
+    process = SERVER.Process(target=_run, args=(command,))
+    process.start()
+    return process
+
+
+def ended(process: BaseProcess, seconds: float) -> bool:
     """Whether the process ends by itself within so many seconds."""
-    deadline = time.monotonic() + seconds
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            if os.waitstatus_to_exitcode(status):
-                raise RuntimeError(f"a run failed with status {os.waitstatus_to_exitcode(status)}")
-            return True
-        if time.monotonic() >= deadline:
-            return False
-        time.sleep(0.001)
+    process.join(seconds)
+    if process.exitcode:
+        raise RuntimeError(f"a run failed with status {process.exitcode}")
+    return process.exitcode == 0
 
 
 def kept(config: Config, command: str, out: Path) -> tuple[int, float, int]:
@@ -114,41 +111,33 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     if config.kills < 2:
         raise checks.fail("kills", "be at least 2", config.kills)
     random = np.random.default_rng(config.seed)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # a process with threads is not safe to fork
     kills: list[tuple[float, ...]] = []
     jobs: list[tuple[float, ...]] = []
-    try:
-        with tempfile.TemporaryDirectory() as scratch:
-            for command in COMMANDS:  # loads all libraries, which the forked processes then hold
-                with contextlib.redirect_stdout(io.StringIO()):
-                    cli.main(arguments(SMOKE, command, Path(scratch) / "first"))
-            for index, command in enumerate(COMMANDS):
-                whole = Path(scratch) / command
-                begin = time.monotonic()
-                if not ended(begun(arguments(config, command, whole)), 3600.0):
-                    raise RuntimeError("the undisturbed run took more than an hour")
-                duration, reference = time.monotonic() - begin, contents(whole)
-                wanted = len(kills) + config.kills // 2
-                while len(kills) < wanted:
-                    out, before = Path(scratch) / f"{command}-{len(jobs)}", len(kills)
-                    while True:
-                        start = time.time()
-                        child = begun(arguments(config, command, out))
-                        if ended(child, random.uniform(0, duration) if len(kills) < wanted else 3600.0):
-                            break
-                        os.kill(child, signal.SIGKILL)
-                        os.waitpid(child, 0)
-                        now = time.time()
-                        count, saved, size = kept(config, command, out)
-                        kills.append((index, len(jobs), now - start, now - max(saved, start), count, size))
-                    left = {path.name for path in out.iterdir()} | {
-                        path.name for path in out.parent.glob(f".{out.name}.*")
-                    }
-                    clean = left == {path.name for path in whole.iterdir()}
-                    jobs.append((index, len(kills) - before, contents(out) == reference, clean, duration))
-    finally:
-        torch.set_num_threads(threads)
+    with tempfile.TemporaryDirectory() as scratch:
+        for command in COMMANDS:  # the first processes load what is loaded late
+            ended(begun(arguments(SMOKE, command, Path(scratch) / "first")), 3600.0)
+        for index, command in enumerate(COMMANDS):
+            whole = Path(scratch) / command
+            begin = time.monotonic()
+            if not ended(begun(arguments(config, command, whole)), 3600.0):
+                raise RuntimeError("the undisturbed run took more than an hour")
+            duration, reference = time.monotonic() - begin, contents(whole)
+            wanted = len(kills) + config.kills // 2
+            while len(kills) < wanted:
+                out, before = Path(scratch) / f"{command}-{len(jobs)}", len(kills)
+                while True:
+                    start = time.time()
+                    child = begun(arguments(config, command, out))
+                    if ended(child, random.uniform(0, duration) if len(kills) < wanted else 3600.0):
+                        break
+                    child.kill()
+                    child.join()
+                    now = time.time()
+                    count, saved, size = kept(config, command, out)
+                    kills.append((index, len(jobs), now - start, now - max(saved, start), count, size))
+                left = {path.name for path in out.iterdir()} | {path.name for path in out.parent.glob(f".{out.name}.*")}
+                clean = left == {path.name for path in whole.iterdir()}
+                jobs.append((index, len(kills) - before, contents(out) == reference, clean, duration))
     k, j = np.array(kills).T, np.array(jobs).T
     return xarray.Dataset(
         {

@@ -2,13 +2,16 @@
 
 import itertools
 import json
+import multiprocessing
 import os
+import pkgutil
 import resource
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,7 +20,7 @@ import xarray
 from safetensors.torch import load_file
 
 import torchchain as tc
-from torchchain import checkpoint, cli, commands, ensemble, outputs
+from torchchain import checkpoint, cli, commands, ensemble
 from torchchain.checkpoint import Checkpoint, CheckpointWarning
 from torchchain.checks import FieldError
 
@@ -69,24 +72,30 @@ def whole():
 # Killed at any moment
 
 
+SERVER = multiprocessing.get_context("forkserver")  # forks from a process that has no threads yet
+SERVER.set_forkserver_preload(["torchchain.commands", "test_checkpoint"])
+
+
+def command_in_a_process(arguments, prepare):
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    commands.outputs.figure = lambda drawn: lambda path: path.write_bytes(b"")
+    prepare()
+    os._exit(cli.main(arguments))
+
+
 def forked(arguments, prepare):
-    """The status of a command in a forked process, where ``prepare`` is called first."""
-    child = os.fork()
-    if child == 0:
-        status = 99
-        try:
-            silent = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(silent, 1)
-            os.dup2(silent, 2)
-            prepare()
-            status = cli.main(arguments)
-        finally:
-            os._exit(status)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    """The status of a command in a process of its own, where ``prepare`` is called first."""
+    process = SERVER.Process(target=command_in_a_process, args=(arguments, prepare))
+    process.start()
+    process.join(120)
+    return process.exitcode
 
 
 def killed_at(owner, name, count, after):
-    """SIGKILL at the count-th call of a function, before or after it."""
+    """SIGKILL at the count-th call of a function of the named owner, before or after it."""
+    owner = pkgutil.resolve_name(owner)
     function, left = getattr(owner, name), itertools.count(count, -1)
 
     def deadly(*arguments, **settings):
@@ -102,14 +111,14 @@ def killed_at(owner, name, count, after):
 
 
 MOMENTS = [
-    pytest.param(os, "replace", 0, False, id="before the first part appears"),
-    pytest.param(os, "replace", 7, False, id="before a part is replaced"),
-    pytest.param(os, "replace", 7, True, id="after a part is replaced"),
-    pytest.param(os, "fsync", 9, False, id="in a part that is half written"),
-    pytest.param(ensemble.EnsembleMoments, "absorb", 5, True, id="between chunks"),
-    pytest.param(outputs, "write", 0, False, id="before the results are written"),
-    pytest.param(outputs, "sha256", 2, True, id="while the results are written"),
-    pytest.param(Checkpoint, "clear", 0, False, id="with results and checkpoint both there"),
+    pytest.param("os", "replace", 0, False, id="before the first part appears"),
+    pytest.param("os", "replace", 7, False, id="before a part is replaced"),
+    pytest.param("os", "replace", 7, True, id="after a part is replaced"),
+    pytest.param("os", "fsync", 9, False, id="in a part that is half written"),
+    pytest.param("torchchain.ensemble:EnsembleMoments", "absorb", 5, True, id="between chunks"),
+    pytest.param("torchchain.outputs", "write", 0, False, id="before the results are written"),
+    pytest.param("torchchain.outputs", "sha256", 2, True, id="while the results are written"),
+    pytest.param("torchchain.checkpoint:Checkpoint", "clear", 0, False, id="with results and checkpoint both there"),
 ]
 
 
@@ -129,7 +138,7 @@ def reference(tmp_path_factory):
 @pytest.mark.usefixtures("no_drawing")
 def test_killed_and_resumed(command, owner, name, count, after, reference, tmp_path):
     arguments = [command, *FLAGS, *EVERY, "--out", str(tmp_path / "out")]
-    assert forked(arguments, lambda: killed_at(owner, name, count, after)) == -signal.SIGKILL
+    assert forked(arguments, partial(killed_at, owner, name, count, after)) == -signal.SIGKILL
     assert cli.main(arguments) == 0
     assert data_of(tmp_path / "out") == reference[command]
     assert "checkpoint" not in os.listdir(tmp_path / "out")
@@ -145,7 +154,8 @@ def test_killed_and_resumed(command, owner, name, count, after, reference, tmp_p
 def test_killed_again_and_again(reference, tmp_path):
     arguments = ["simulate", *FLAGS, *EVERY, "--out", str(tmp_path / "out")]
     for _ in range(6):
-        assert forked(arguments, lambda: killed_at(ensemble.EnsembleMoments, "absorb", 3, False)) == -signal.SIGKILL
+        killing = partial(killed_at, "torchchain.ensemble:EnsembleMoments", "absorb", 3, False)
+        assert forked(arguments, killing) == -signal.SIGKILL
         assert len(os.listdir(tmp_path / "out" / "checkpoint")) <= 2  # what came before, and the session's own
     assert cli.main(arguments) == 0
     assert data_of(tmp_path / "out") == reference["simulate"]
@@ -365,7 +375,7 @@ def test_no_room_for_the_results(reference, tmp_path):
     """With files limited to a kilobyte neither checkpoint nor results fit; nothing half-written stays."""
     arguments = ["simulate", *FLAGS, *EVERY, "--out", str(tmp_path / "out")]
     limits = (1024, resource.getrlimit(resource.RLIMIT_FSIZE)[1])
-    assert forked(arguments, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limits)) == 2
+    assert forked(arguments, partial(resource.setrlimit, resource.RLIMIT_FSIZE, limits)) == 2
     left = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert left == []
     assert cli.main(arguments) == 0

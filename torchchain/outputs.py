@@ -34,11 +34,22 @@ def check_writable(out: str | Path) -> Path:
         if os.path.lexists(out) and not out.is_dir():
             raise checks.fail("out", "be a folder", str(out))
         parent = out
-        while not parent.exists():
+        while not _is_there(parent):
             parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise checks.fail("out", "be writable", str(out))
     return out
+
+
+def _is_there(path: Path) -> bool:
+    """Whether something has this path; any reason but its absence is an error."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return False
+    except ValueError as error:  # a null byte
+        raise checks.fail("out", "be writable", f"{str(path)!r}: {error}") from None
+    return True
 
 
 @contextmanager

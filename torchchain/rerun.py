@@ -20,6 +20,9 @@ from torchchain.cli import Calibrate, Predict, Rerun, Simulate
 
 COMMANDS = ("simulate", "calibrate", "predict")
 DATA = {"simulate": ("results.nc",), "calibrate": ("transfer.nc", "model.safetensors"), "predict": ("results.nc",)}
+NEEDED = {"files": dict, "versions": dict, "device": str, "config_sha256": str}
+NEEDED_OF_PREDICT = {"method": str, "model.path": str, "model.sha256": str}
+NEEDED_OF_ENSEMBLE = {"resolved.method": str, "resolved.options": dict}
 SAID_ELSEWHERE = ("torchchain_version",)  # attributes that the record's versions hold
 
 
@@ -63,11 +66,18 @@ def read_record(folder: Path) -> dict[str, Any]:
         raise checks.fail(
             where, "hold the run.json and config.toml of a run", f"{error.strerror}: {error.filename}"
         ) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise checks.fail(f"{where}/run.json", "be JSON", str(error)) from None
     arguments = record.get("arguments") if isinstance(record, dict) else None
-    if not arguments or arguments[0] not in COMMANDS or "files" not in record:
+    if not isinstance(arguments, list) or not arguments or arguments[0] not in COMMANDS or "files" not in record:
         raise checks.fail(where, f"hold a run of {', '.join(COMMANDS)}", checks.shown(arguments))
+    needed = NEEDED | (NEEDED_OF_PREDICT if arguments[0] == "predict" else NEEDED_OF_ENSEMBLE)
+    for name, kind in needed.items():
+        held: Any = record
+        for key in name.split("."):
+            held = held.get(key) if isinstance(held, dict) else None
+        if not isinstance(held, kind):
+            raise checks.fail(f"{where}/run.json", f"hold {name} as {kind.__name__}", checks.shown(held))
     if hashlib.sha256(config).hexdigest() != record["config_sha256"]:
         raise checks.fail(f"{folder}/config.toml", "be the one that the run left", "a changed file")
     for name in DATA[arguments[0]]:

@@ -175,6 +175,8 @@ def _member(where: str, header: dict[str, Any], tensors: dict[str, torch.Tensor]
             checks.number("report.horizon", report["horizon"], at_least=0)
         if "damping" in report and checks.real_tensor("report.damping", report["damping"]).shape != (scene.n_bands,):
             raise checks.fail("report.damping", f"hold {scene.n_bands} numbers", report["damping"])
+        if "damping" in report and min(report["damping"]) < 0:
+            raise checks.fail("report.damping", "not be negative", report["damping"])
     except (checks.FieldError, checks.FieldTypeError, TypeError) as error:
         raise checks.fail(where, "hold valid fields", f"{error}") from None
     if scene.n_bands != model.n_bands or header["n_bands"] != model.n_bands:

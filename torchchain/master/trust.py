@@ -83,13 +83,13 @@ class Uncertainty:
             "stderr": stderr,
         }
         shapes = {"rates_stderr": (n, n), "basis_stderr": (n, n), "stderr_times": (count,), "stderr": (n, count, n)}
+        if stderr_times.ndim != 1 or count < 2 or not bool((stderr_times.diff() > 0).all()):
+            raise checks.fail("stderr_times", "be at least two increasing times", f"{count} times")
         for name, value in values.items():
             checks.real_tensor(name, value)
             if tuple(value.shape) != shapes[name]:
                 raise checks.fail(name, f"have shape {shapes[name]}", f"shape {tuple(value.shape)}")
             checks.first_bad(name, "not be negative", value, value < 0)
-        if count < 2 or not bool((stderr_times.diff() > 0).all()):
-            raise checks.fail("stderr_times", "be at least two increasing times", f"{count} times")
         return cls(rates_stderr, basis_stderr, stderr_times, stderr)
 
 
