@@ -257,6 +257,7 @@ def _strengths(ax: Axes, data: xarray.Dataset) -> None:
         title="(b) over disorder",
     )
     _plain_ticks(ax)
+    ax.set_xticks([0.05, 0.1, 0.2, 0.3, 0.5])
     ax.legend(fontsize="small")
 
 
@@ -268,13 +269,15 @@ def _coverage(ax: Axes, data: xarray.Dataset) -> None:
     ax.plot(part.strength, part.covered_mixed, "C3s--", label="mixtures of bands")
     ax.set(xscale="log", ylim=(0, 1), xlabel=r"disorder $\xi$", ylabel="share of energies within one standard error",
            title="(c) error bars")  # fmt: skip
-    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_xticks([0.05, 0.1, 0.2, 0.3, 0.5])
+    _plain_ticks(ax)
     ax.legend(fontsize="small")
 
 
 def _plain_ticks(ax: Axes) -> None:
-    for label in (ax.yaxis.set_major_formatter, ax.xaxis.set_major_formatter):
-        label("{x:g}")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
 
 
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:

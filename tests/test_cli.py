@@ -356,8 +356,11 @@ def test_nan_devices_and_empty_words(run):
 
 CALIBRATE_FLAGS = [
     ("--fit magic", "method must be one of analytic, linear, nonlinear, adam, projection, got 'magic'"),
-    ("--model magic", "model must be one of paper, exact_psi, basis_matrix, memory, got 'magic'"),
-    ("--fit linear --model memory", "model must be one of paper, exact_psi, basis_matrix for method 'linear'"),
+    ("--model magic", "model must be one of paper, exact_psi, basis_matrix, swing_in, memory, got 'magic'"),
+    (
+        "--fit linear --model memory",
+        "model must be one of paper, exact_psi, basis_matrix, swing_in for method 'linear'",
+    ),
     ("--fit projection --model paper", "model must be one of memory for method 'projection'"),
     ("--window 1", "--window must be"),
     ("--window 2 1", "window must be greater than 2, got 1"),
@@ -486,7 +489,7 @@ REQUESTS = [
     ("times = 3", "times must be one-dimensional"),
     ("times = [2, 1]", "times must increase strictly"),
     ("[times]\nend = 3", "times must have only the keys start, stop, step"),
-    ("n_bands = 4", "predict must have only the keys source, initial, times"),
+    ("n_bands = 4", "predict must have only the keys strength, source, initial, times"),
 ]
 
 
