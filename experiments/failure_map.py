@@ -382,7 +382,10 @@ def _long_exponential() -> Edge:
 
 
 def _phases(seed: int) -> Edge:
-    """Single precision: each frequency is off by some eps of the highest, and phases by that times t."""
+    """Single precision: each frequency is off by some eps of the highest, and phases by that times t.
+
+    How each one rounds depends on the processor and its threads: the edge was found at 1.2 to 2 times the estimate.
+    """
     masses = tc.Disorder().masses(256, 1, seed)[0].float()
     exact, rounded = tc.Chain(masses.double()), tc.Chain(masses)
     modes, modes32 = tc.normal_modes(exact), tc.normal_modes(rounded)
@@ -401,7 +404,7 @@ def _phases(seed: int) -> Edge:
         return float((blurred.double() - exactly).norm() / exactly.norm())
 
     return Edge(
-        "modes, float32", "time until states are off by 10 %", 0.1 / off, "t times the frequencies' root-mean-square error", 1.6,
+        "modes, float32", "time until states are off by 10 %", 0.1 / off, "t times the frequencies' root-mean-square error", 3.0,
         error, 0.1, (0.1, 5.0), lambda value: tc.evolve(rounded, state32, [value], "modes"),
     )  # fmt: skip
 

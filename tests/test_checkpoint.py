@@ -64,6 +64,15 @@ def equal(a, b):
     return a.identical(b) and all(a[name].values.tobytes() == b[name].values.tobytes() for name in a.variables)
 
 
+@pytest.fixture
+def one_thread():
+    """Chunks end in order, so that how many are kept is certain."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def whole():
     return tc.simulate(SCENE, "modes")
@@ -172,6 +181,7 @@ def test_ctrl_c(tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # which a shell's background jobs ignore
     )
     folder, patience = tmp_path / "out" / "checkpoint", time.monotonic() + 120
     while not list(folder.glob("*.safetensors")) and time.monotonic() < patience:
@@ -199,6 +209,7 @@ def test_a_finished_run_is_not_computed_again(whole, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("chunks", [1, 2, 3, 10, 19])
+@pytest.mark.usefixtures("one_thread")
 def test_interrupted_and_resumed(chunks, whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         stopped_after(chunks, patch)
@@ -209,6 +220,7 @@ def test_interrupted_and_resumed(chunks, whole, tmp_path, monkeypatch):
     assert again.resumed == 2 * chunks
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_a_failure_keeps_what_is_finished(whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         stopped_after(4, patch, RuntimeError("a machine check"))
@@ -253,6 +265,7 @@ def test_the_plan_is_kept_too(tmp_path, monkeypatch):
     assert tc.simulate(scene, checkpoint=tmp_path).attrs["method"] == "modes"
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_few_numbers_are_kept(tmp_path):
     """Nodes of the moments, not realizations: 1023 chains of three numbers each take ten nodes or fewer."""
     scene = replace(SCENE, realizations=1023, observables=("center",))
