@@ -1,3 +1,5 @@
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -168,3 +170,9 @@ def test_stiffness_beyond_the_solver():
 def test_damped_chains_have_no_normal_modes():
     with pytest.raises(FieldError, match="damping must be zero for normal modes .*got up to 0.1"):
         tc.normal_modes(tc.Chain(torch.ones(4), damping=0.1))
+
+
+def test_two_modes_are_no_wide_spectrum():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tc.normal_modes(tc.Chain(torch.tensor([1.0, 1.2], dtype=torch.float64)))
