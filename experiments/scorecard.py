@@ -119,7 +119,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
         other = _ensemble(
             config, config.other_strength, config.fresh_seed, config.other_realizations, n_particles, n_bands, device
         )
-        for rung in (rungs(config)[1], rungs(config)[-1]):
+        for rung in rungs(config):
             master, fit = _calibrated(own, rung)
             entries.append(_score(rung[0], master, own, other, weights, fit, seconds))
         if n_bands == config.n_bands:
