@@ -330,21 +330,15 @@ def _panel(ax: Axes, part: xarray.Dataset, cost: str, title: str, floor: float) 
     ax.xaxis.set_minor_formatter("")
 
 
-def best(part: xarray.Dataset, accuracy: float) -> xarray.Dataset | None:
-    """The fastest run with at most this error."""
-    good = part.isel(run=part.error.values <= accuracy)
-    return good.isel(run=int(good.seconds.values.argmin())) if good.sizes["run"] else None
-
-
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:
     rows = []
     for i, name in enumerate(config.waves):
         part = data.isel(run=data.wave.values == name)
         rows.append(Row(f"{name}: reference's error", float(data.reference_error[i]), note=f"against Bessel functions on the ordered chain {float(data.bessel_error[i]):.1e}"))  # fmt: skip
         for accuracy in (1e-2, 1e-6, 1e-10):
-            found = best(part, accuracy)
+            found = harness.fastest(part, accuracy)
             if found is not None:
-                peer = best(part.isel(run=~np.isin(part.method.values, list(COLORS))), accuracy)
+                peer = harness.fastest(part.isel(run=~np.isin(part.method.values, list(COLORS))), accuracy)
                 ratio = (
                     ""
                     if peer is None

@@ -217,12 +217,6 @@ def _panel(ax: Axes, part: xarray.Dataset, cost: str, title: str, floor: float) 
     ax.axhline(max(floor, 1.2e-17), color="k", linestyle="--", linewidth=0.8)
 
 
-def best(part: xarray.Dataset, accuracy: float) -> xarray.Dataset | None:
-    """The fastest run with at most this error."""
-    good = part.isel(run=part.error.values <= accuracy)
-    return good.isel(run=int(good.seconds.values.argmin())) if good.sizes["run"] else None
-
-
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:
     rows = []
     for i, case in enumerate((MILD, STIFF)):
@@ -238,7 +232,7 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
         rows.append(Row(f"{case}: error of expm", float(exact.error[0]), note=f"{float(exact.seconds[0]):.2g} s"))
         peers = part.isel(run=np.isfinite(part.evaluations.values))
         for accuracy in (1e-3, 1e-6, 1e-9):
-            found = best(peers, accuracy)
+            found = harness.fastest(peers, accuracy)
             if found is not None:
                 ratio = float(found.seconds / exact.seconds[0])
                 note = f"{found.solver.values} {found.option.values}, {int(found.evaluations)} evaluations, {ratio:.3g} times expm"

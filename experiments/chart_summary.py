@@ -69,39 +69,27 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     return xarray.Dataset(data)
 
 
-def _evolvers(data: xarray.Dataset, config: Config) -> Iterator[dict[str, Any]]:
-    """For every scene and accuracy, the fastest run of each method."""
-    for wave in dict.fromkeys(data.wave.values):
+def _fastest(data: xarray.Dataset, scene: str, method: str, config: Config) -> Iterator[tuple[dict[str, Any], Any]]:
+    """For every scene and accuracy, the fastest run of each method that reaches it: what both charts tell, and the run."""
+    for wave in dict.fromkeys(data[scene].values):
         for accuracy in config.accuracies:
-            for method in dict.fromkeys(data.method.values):
-                part = data.isel(run=(data.wave.values == wave) & (data.method.values == method))
-                found = chart_evolvers.best(part, accuracy)
+            for name in dict.fromkeys(data[method].values):
+                found = harness.fastest(
+                    data.isel(run=(data[scene].values == wave) & (data[method].values == name)), accuracy
+                )
                 if found is not None:
-                    yield {
-                        "scene": wave,
-                        "accuracy": accuracy,
-                        "method": method,
-                        "option": f"{found.option.values} {found.precision.values}".strip(),
-                        "error": float(found.error),
-                        "seconds": float(found.seconds),
-                    }
+                    told = {"scene": wave, "accuracy": accuracy, "method": name}
+                    yield told | {"error": float(found.error), "seconds": float(found.seconds)}, found
+
+
+def _evolvers(data: xarray.Dataset, config: Config) -> Iterator[dict[str, Any]]:
+    for told, found in _fastest(data, "wave", "method", config):
+        yield told | {"option": f"{found.option.values} {found.precision.values}".strip()}
 
 
 def _solvers(data: xarray.Dataset, config: Config) -> Iterator[dict[str, Any]]:
-    """For every kind of rates and accuracy, the fastest run of each solver."""
-    for case in dict.fromkeys(data.rates.values):
-        for accuracy in config.accuracies:
-            for solver in dict.fromkeys(data.solver.values):
-                part = data.isel(run=(data.rates.values == case) & (data.solver.values == solver))
-                found = chart_solvers.best(part, accuracy)
-                if found is not None:
-                    yield {
-                        "scene": case,
-                        "accuracy": accuracy,
-                        "method": solver,
-                        "error": float(found.error),
-                        "seconds": float(found.seconds),
-                    }
+    for told, _ in _fastest(data, "rates", "solver", config):
+        yield told
 
 
 def _models(data: xarray.Dataset) -> Iterator[dict[str, Any]]:

@@ -260,6 +260,12 @@ def panels(rows: int, columns: int, width: float = 4.8, height: float = 3.7) -> 
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def fastest(runs: xarray.Dataset, accuracy: float) -> xarray.Dataset | None:
+    """The fastest of the runs with at most this error."""
+    good = runs.isel(run=runs.error.values <= accuracy)
+    return good.isel(run=int(good.seconds.values.argmin())) if good.sizes["run"] else None
+
+
 def jackknife(
     blocks: Tensor, counts: Sequence[int], statistic: Callable[[Tensor], Tensor], groups: int | None = None
 ) -> tuple[Tensor, Tensor]:

@@ -106,6 +106,14 @@ def _figure(width: float, height: float, rows: int, columns: int) -> Any:
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def _out_and_device(flags: Simulate | Calibrate) -> tuple[Path, str]:
+    """Folder and device of a run over an ensemble, and its method, checked before anything is computed."""
+    out = outputs.check_writable(flags.out)
+    device = str(checks.device("device", ranks.own_device(flags.device)))
+    checks.choice("method", flags.method, ("auto", *METHODS))
+    return out, device
+
+
 def run_simulate(
     flags: Simulate, arguments: list[str], options: dict[str, Any] | None = None, keep: bool = True
 ) -> None:
@@ -118,9 +126,7 @@ def run_simulate(
     """
     began = time.time()
     scene = planning.resolved(_scene(flags)[0])
-    out = outputs.check_writable(flags.out)
-    device = str(checks.device("device", ranks.own_device(flags.device)))
-    checks.choice("method", flags.method, ("auto", *METHODS))
+    out, device = _out_and_device(flags)
     checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
     with _keeping(checkpoint):
         _simulate(flags, scene, out, device, arguments, options, checkpoint, began)
@@ -232,9 +238,7 @@ def run_calibrate(
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])
-    out = outputs.check_writable(flags.out)
-    device = str(checks.device("device", ranks.own_device(flags.device)))
-    checks.choice("method", flags.method, ("auto", *METHODS))
+    out, device = _out_and_device(flags)
     recipe(scene, **settings)  # before the ensemble is computed
     checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
     with _keeping(checkpoint):

@@ -198,20 +198,23 @@ def _headers(where: str, metadata: Mapping[str, str], expected: str) -> list[dic
         raise checks.fail(where, f"carry the format {expected}", checks.shown(header))
     if expected == FORMAT:
         return [_header(where, header)]
-    version, members = header.get("format_version"), header.get("members")
-    if version != FORMAT_VERSION or isinstance(version, bool):
-        raise checks.fail(where, f"have format version {FORMAT_VERSION}", version)
+    _check_version(where, header)
+    members = header.get("members")
     if not isinstance(members, list) or not 1 <= len(members) <= MOST_MEMBERS:
         raise checks.fail(where, f"have 1 to {MOST_MEMBERS} members", checks.shown(members))
     return [_header(where, member) for member in members]
 
 
-def _header(where: str, header: Any) -> dict[str, Any]:
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise checks.fail(where, f"carry the format {FORMAT}", checks.shown(header))
+def _check_version(where: str, header: Mapping[str, Any]) -> None:
     version = header.get("format_version")
     if version != FORMAT_VERSION or isinstance(version, bool):
         raise checks.fail(where, f"have format version {FORMAT_VERSION}", version)
+
+
+def _header(where: str, header: Any) -> dict[str, Any]:
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise checks.fail(where, f"carry the format {FORMAT}", checks.shown(header))
+    _check_version(where, header)
     kinds: dict[str, tuple[type, ...]] = {
         "kind": (str,),
         "n_bands": (int,),

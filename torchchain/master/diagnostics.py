@@ -71,11 +71,10 @@ def chapman_kolmogorov(
         raise checks.fail("multiples", "be increasing", numbers)
     first = _at("lag", transfer, lag)
     places = [_at("multiples", transfer, n * lag) for n in numbers]
-    powers = torch.tensor(numbers)
 
     def both(mean: Tensor) -> tuple[Tensor, Tensor]:
         step = mean[:, first]
-        predicted = torch.stack([torch.linalg.matrix_power(step, int(n)) for n in powers], dim=1)
+        predicted = torch.stack([torch.linalg.matrix_power(step, n) for n in numbers], dim=1)
         return mean[:, places], predicted
 
     measured, predicted = both(transfer.mean)

@@ -116,9 +116,7 @@ class MasterEquation(nn.Module):
         """
         solver = SOLVERS[checks.choice("method", method, SOLVERS)]
         checks.known_keys(f"options of solver '{method}'", options, solver.options)
-        initial = checks.real_tensor("initial", initial).to(self.rates)
-        if initial.ndim == 0 or initial.shape[-1] != self.n_bands:
-            raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}")
+        initial = self._initial(initial)
         times = checks.times("times", times).to(self.rates)
         fed = None if supply is None else self._supply(supply, initial, times)
         with single_thread():
@@ -127,6 +125,12 @@ class MasterEquation(nn.Module):
             raise IntegrationError(f"solver '{method}' must stay finite, got overflow up to time {float(times[-1]):g}")
         self._warn(initial, times, fed, energy.detach())
         return energy
+
+    def _initial(self, initial: Any) -> Tensor:
+        initial = checks.real_tensor("initial", initial).to(self.rates)
+        if initial.ndim == 0 or initial.shape[-1] != self.n_bands:
+            raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}")
+        return initial
 
     def _supply(self, supply: Any, initial: Tensor, times: Tensor) -> Tensor:
         supply = checks.real_tensor("supply", supply).to(self.rates)
@@ -142,7 +146,7 @@ class MasterEquation(nn.Module):
         return supply.expand(*batch, *shape)
 
     def _warn(self, initial: Tensor, times: Tensor, fed: Tensor | None, energy: Tensor) -> None:
-        """The warnings of :meth:`solve`; four calls from the user's own line."""
+        """The warnings of :meth:`solve`, shown at the line that called it."""
         end = float(times[-1])
         if end > self.horizon * (1 + 1e-9):
             warnings.warn(
@@ -156,7 +160,8 @@ class MasterEquation(nn.Module):
         if fed is not None:
             steps = torch.diff(times, prepend=times.new_zeros(1))
             total = total + (fed.sum(-1) * steps).cumsum(-1)
-        gained = energy.sum(-1) / total.clamp(min=torch.finfo(total.dtype).tiny) - 1
+        total = total.clamp(min=torch.finfo(total.dtype).tiny)
+        gained = energy.sum(-1) / total - 1
         if float(gained.max()) > GAINED_SHARE:
             when = float(times[int(gained.reshape(-1, len(times)).amax(0).argmax())])
             warnings.warn(
@@ -165,7 +170,7 @@ class MasterEquation(nn.Module):
                 TrustWarning,
                 stacklevel=3,
             )
-        lowest = float((energy.amin(-1) / total.clamp(min=torch.finfo(total.dtype).tiny)).min())
+        lowest = float((energy.amin(-1) / total).min())
         if lowest < -NEGATIVE_SHARE:
             warnings.warn(
                 f"lowest predicted energy of a band is {lowest:.2g} of the total: the model is that uncertain there",
@@ -184,14 +189,11 @@ class MasterEquation(nn.Module):
         """
         if self.uncertainty is None:
             raise checks.fail("bootstrap", "be at least 2 in calibrate() for error bars", 0)
-        initial = checks.real_tensor("initial", initial).to(self.rates)
-        if initial.ndim == 0 or initial.shape[-1] != self.n_bands:
-            raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}")
-        return self.uncertainty.of(initial, checks.times("times", times).to(self.rates))
+        return self.uncertainty.of(self._initial(initial), checks.times("times", times).to(self.rates))
 
     def dissipated(self, initial: Any, times: Any) -> Tensor:
         """Energy lost to damping up to each time, (*batch, time): what :meth:`solve` leaves of the start is the rest."""
-        initial = checks.real_tensor("initial", initial).to(self.rates)
+        initial = self._initial(initial)
         return initial.sum(-1)[..., None] - self.solve(initial, times).sum(-1)
 
     def concerns(self, scene: Scene) -> list[str]:

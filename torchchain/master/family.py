@@ -98,7 +98,7 @@ class MasterFamily:
         """
         weights = self.weights(strength)
         chosen = {m.calibration.scene.disorder.strength: m for m in self.members}
-        if list(weights.values()) == [1.0] and next(iter(weights)) in chosen:
+        if len(weights) == 1:  # a member's own strength
             return chosen[next(iter(weights))]
         parts = [(w, chosen[xi]) for xi, w in weights.items() if xi in chosen]
         scene = parts[0][1].calibration.scene

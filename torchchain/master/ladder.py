@@ -143,8 +143,8 @@ def fit(
     """
     if recipe.model == "memory":
         return _fit_memory(sample, recipe, near, progress)
-    damping = loss_rates(sample) if sample.damped else None
-    whole, sample = sample, sample.distribution()
+    damping, loss = _loss(sample) if sample.damped else (None, {})
+    sample = sample.distribution()
     basis = BASES[recipe.model or "paper"](sample)
     free = (1 - basis.diagonal()).clamp(min=torch.finfo(basis.dtype).eps)
     linear = linear_rates(sample.times, sample.mean, free, recipe.window)
@@ -161,8 +161,7 @@ def fit(
     else:
         start = linear if near is None else near.rates.detach()
         rates, delay, report = _fit_adam(sample, basis, start, delay, recipe.adam, progress)
-    if damping is not None:
-        report = report | {"damping": damping.tolist(), "loss_misfit": loss_misfit(whole, damping)}
+    report = report | loss
     if delay is not None:
         return SwingInModel(rates, basis, delay, damping), report | {"delay": float(delay)}
     return RateModel(rates, basis, damping), report
@@ -176,17 +175,23 @@ def loss_rates(sample: Sample) -> Tensor:
     """
     import scipy.optimize
 
-    held = torch.cumulative_trapezoid(sample.mean, sample.times, dim=1)  # [source, time, band]
-    lost = sample.mean[:, :1].sum(-1) - sample.mean[:, 1:].sum(-1)
+    held, lost = _held_and_lost(sample)
     found, _ = scipy.optimize.nnls(held.flatten(0, 1).numpy(), lost.flatten().numpy())
     return torch.from_numpy(found).to(sample.mean)
 
 
-def loss_misfit(sample: Sample, damping: Tensor) -> float:
-    """Root mean square difference of the energy lost and what the damping explains, in units of the start."""
+def _held_and_lost(sample: Sample) -> tuple[Tensor, Tensor]:
+    """Integral of the energy over time, [source, time, band], and the energy lost by then, [source, time]."""
     held = torch.cumulative_trapezoid(sample.mean, sample.times, dim=1)
-    lost = sample.mean[:, :1].sum(-1) - sample.mean[:, 1:].sum(-1)
-    return float((held @ damping - lost).square().mean().sqrt())
+    return held, sample.mean[:, :1].sum(-1) - sample.mean[:, 1:].sum(-1)
+
+
+def _loss(sample: Sample) -> tuple[Tensor, dict[str, Any]]:
+    """d of Eq. 51, and a report: d, and the root mean square of the lost energy that it leaves unexplained."""
+    damping = loss_rates(sample)
+    held, lost = _held_and_lost(sample)
+    misfit = float((held @ damping - lost).square().mean().sqrt())
+    return damping, {"damping": damping.tolist(), "loss_misfit": misfit}
 
 
 def _fit_nonlinear(
@@ -230,7 +235,5 @@ def _fit_memory(
     guess = near if isinstance(near, MemoryModel) else None
     with single_blas_thread():
         tensors, report = fit_memory(sample.times, sample.mean, basis, recipe.order, progress=progress, near=guess)
-    if sample.damped:
-        damping = loss_rates(sample)
-        report = report | {"damping": damping.tolist(), "loss_misfit": loss_misfit(sample, damping)}
-    return MemoryModel(rates=rates, **tensors), report
+    loss = _loss(sample)[1] if sample.damped else {}
+    return MemoryModel(rates=rates, **tensors), report | loss

@@ -129,10 +129,9 @@ def bootstrap(
     # blocks drawn with replacement spread (blocks - 1) / blocks of what independent ensembles do
     scale = math.sqrt(blocks / (blocks - 1))
     spread = scale * torch.stack(paths).std(0)
-    missed = (model.transfer(transfer.times).detach() - transfer.mean).square()
-    noise = torch.zeros_like(missed)
-    noise[:, kept] = (transfer.stderr[:, kept].square() - spread.square()).clamp(min=0)
-    own = _smooth((missed - noise)[:, kept]).clamp(min=0)
+    missed = (model.transfer(times).detach() - transfer.mean[:, kept]).square()
+    noise = (transfer.stderr[:, kept].square() - spread.square()).clamp(min=0)
+    own = _smooth(missed - noise).clamp(min=0)
     return Uncertainty(
         scale * torch.stack(rates).std(0), scale * torch.stack(bases).std(0), times, (spread.square() + own).sqrt()
     )
