@@ -62,6 +62,7 @@ SMOKE = Config(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def bare(older, old, weight, n, pairs):  # type: ignore[no-untyped-def]
     """T_k+1 = 2 x T_k - T_k-1 in place, 2 * pairs times, on n particles between two resting ones, and nothing else."""
+    stencil._wide_vectors()  # as the kernels
     for _ in range(pairs):
         for p in range(1, n + 1):
             x = old[p]

@@ -82,7 +82,8 @@ def test_kernels_agree_with_torch(boundary):
         state = a_start(kind, chain)
         for times in GRIDS.values():
             one, other = (chebyshev_states(chain, state, times, compiled=compiled) for compiled in (True, False))
-            assert error(one, other) < 1e-13
+            # Each rounds on its own way through some 100 stencils an output: both are 9e-14 off the modes.
+            assert error(one, other) < 1.5e-13
 
 
 @pytest.mark.parametrize("grid", ["last", "all"])
@@ -272,8 +273,9 @@ def test_kernels_have_the_same_coefficients():
         expected = chebyshev.coefficients(np.array([frequency]), np.array([time]), 1e-16)[..., 0]
         table = np.zeros((3, 200))
         terms = stencil._coefficients(frequency, time, 1e-16, np.empty(400), *table)
-        assert terms % 4 == 0
-        assert terms >= expected.shape[1] > terms - 4
+        assert terms % 2 == 0
+        assert terms >= expected.shape[1]
+        assert terms < expected.shape[1] + 2 or terms == 4
         assert table[:, : expected.shape[1]] == pytest.approx(expected, abs=1e-15 * max(1, time) * frequency)
         # the order from which on Bessel functions are left out
         assert np.abs(special.jv(stencil._top_order(frequency * time), frequency * time)) < 1e-25

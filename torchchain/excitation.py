@@ -69,7 +69,8 @@ def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float 
         phase: "sin" or "cos". The sine of tone N/2 vanishes at every particle and is an error.
 
     Returns:
-        State (*batch, particle), or (*batch, tone, particle) for a sequence.
+        State (*batch, particle), or (*batch, tone, particle) for a sequence; the batch shares one wave in memory, so
+        clone it before a change in place.
     """
     checks.instance("chain", chain, Chain)
     n = chain.n_particles
@@ -81,12 +82,13 @@ def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float 
     check_tones("tone", tones, n, checks.choice("phase", phase, PHASES))
     # The phase of particle p is (tone p mod N) / N turns: exact integers, whatever the tone.
     particle = torch.arange(1, n + 1)
-    turns = torch.stack([(int(m) * particle) % n for m in tones]).to(torch.float64) / n
+    turns = (torch.tensor([int(m) for m in tones])[:, None] * particle % n).to(torch.float64) / n
     wave = amplitude * (torch.sin if phase == "sin" else torch.cos)(2 * math.pi * turns)
     if not several:
         wave = wave[0]
-    wave = wave.to(chain.masses).expand(*chain.batch_shape, *wave.shape).clone()
-    return State(wave, torch.zeros_like(wave))
+    wave = wave.to(chain.masses)
+    shape = (*chain.batch_shape, *wave.shape)
+    return State(wave.expand(shape), torch.zeros_like(wave).expand(shape))
 
 
 def check_tones(field: str, tones: Sequence[int], n_particles: int, phase: str) -> None:

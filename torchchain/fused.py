@@ -71,7 +71,7 @@ def energy_moments(chain: Chain, state: State, times: Any, definition: str = "si
 
     kind = stencil.SITE_MOMENTS if definition == "site" else stencil.BOND_MOMENTS
     advance.check_work(times)
-    march, steps = stencil.March(advance.rows, mirrored=True), times.double().numpy()
+    march, steps = stencil.March(advance.rows, mirrored=True, once=True), times.double().numpy()
     out = np.empty((advance.rows.count, len(steps), 3))
     stencil.share(lambda begin, end: march.moments(begin, end, steps, kind, out), advance.rows.count)
     moments = torch.from_numpy(out).to(state.displacement.dtype)
@@ -130,23 +130,25 @@ def band_energy(
         strain += rows.contacts[0, 0] * 4 * np.sin(math.pi / n * np.arange(n // 2 + 1)) ** 2
     window = min(len(steps), max(1, _BLOCK // (8 * n)))
     size = min(rows.count, max(1, _BLOCK // (8 * n * window)))
-    march = stencil.March(rows, mirrored=True)
+    march = stencil.March(rows, mirrored=True, once=window == len(steps))
     bands, totals = np.empty((rows.count, len(steps), n_bands)), np.empty((rows.count, len(steps)))
 
     def work(part: tuple[int, int]) -> None:
+        # Little Python a block: a thread that waits for another's is slow to wake.
         begin, end = part
-        buffer = torch.empty(count * size * window * n, dtype=torch.float64)
+        fields = torch.empty((count, min(size, end - begin), window, n), dtype=torch.float64)
+        there = fields.numpy()
         for low in range(begin, end, size):
             high = min(low + size, end)
             for first in range(0, len(steps), window):
                 last = min(first + window, len(steps))
-                shape = (count, high - low, last - first, n)
-                fields = buffer[: math.prod(shape)].view(shape)
-                march.fields(low, high, steps[first:last], kind, fields.numpy(), low)
-                spectra = torch.view_as_real(torch.fft.rfft(fields)).flatten(3).numpy()
-                a, b, c, d = (spectra[min(field, count - 1)] for field in range(4))
-                here = slice(low, high), slice(first, last)
-                stencil.bin_spectra(a, b, c, d, kind, strain, normalize, bands[here], totals[here])
+                if fields.shape[1:3] != (high - low, last - first):
+                    fields = torch.empty((count, high - low, last - first, n), dtype=torch.float64)
+                    there = fields.numpy()
+                march.fields(low, high, steps[first:last], kind, there, low)
+                spectra = torch.fft.rfft(fields).numpy().view(np.float64)
+                stencil.bin_spectra(spectra, kind, strain, normalize, low, first, bands, totals)
+                del spectra  # so that the next lie where these do, in cache
 
     workers = min(torch.get_num_threads(), rows.count)
     for _ in map_in_order(work, stencil.ranges(rows.count, workers), workers):

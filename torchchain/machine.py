@@ -17,7 +17,7 @@ from torchchain.disorder import Disorder
 from torchchain.excitation import Impulse, impulse, standing_wave
 from torchchain.threads import single_thread
 
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -232,6 +232,7 @@ def _decompositions() -> dict[str, float]:
 def _stencils() -> dict[str, float]:
     """The kernels of the Chebyshev expansion, from runs that differ in what they do most of."""
     from torchchain import fused
+    from torchchain.evolvers.chebyshev import LEAP
     from torchchain.predictions import terms
 
     n = 1024
@@ -243,10 +244,10 @@ def _stencils() -> dict[str, float]:
         return _seconds(lambda: fused.energy_moments(ring, wave, times, accuracy=1e-12))
 
     idle = run(torch.zeros(1, dtype=torch.float64))
-    far = (run(torch.tensor([4 * 256 / top], dtype=torch.float64)) - idle) / n
+    far = (run(torch.tensor([4 * LEAP / top], dtype=torch.float64)) - idle) / n
     dense = (run(torch.arange(0, 257, dtype=torch.float64) * 2 / top) - idle) / n
     # far: 4 leaps of two expansions; dense: 32 segments of 8 outputs by one expansion each.
-    degree, reach, mean = terms(256, 1e-12), terms(16, 1e-12), terms(9, 1e-12)
+    degree, reach, mean = terms(LEAP, 1e-12), terms(16, 1e-12), terms(9, 1e-12)
     # Moments take about as long as four sums of a term.
     stencil_and_sum = far / (8 * degree)
     add = max(0.1 * stencil_and_sum, (dense - 32 * reach * stencil_and_sum) / (256 * (mean + 4) - 32 * reach))

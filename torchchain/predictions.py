@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from torchchain.evolvers.chebyshev import LEAP, LONGEST, REACH
 from torchchain.evolvers.drift import total
 from torchchain.evolvers.linearity import elongation_estimate, force_deviation
 from torchchain.excitation import Impulse, State
@@ -255,7 +256,7 @@ def _modes(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtyp
 def terms(z: float, accuracy: float) -> float:
     """Chebyshev terms for a phase z: J_2k(z) falls below the accuracy / 1024 some Airy widths beyond 2k = z."""
     depth = (1.5 * math.log(1024 / accuracy)) ** (2 / 3)
-    return 4 * math.ceil((0.5 * (z + depth * (z / 2) ** (1 / 3)) + 1) / 4)
+    return 2 * math.ceil((0.5 * (z + depth * (z / 2) ** (1 / 3)) + 1) / 2)
 
 
 def _chebyshev(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
@@ -271,11 +272,11 @@ def _chebyshev(method: str, facts: Facts, options: dict[str, Any], dtype: torch.
     limit = facts.typical
     for gap in gaps:
         z = limit * gap
-        leaps = math.ceil(z / 256)
+        leaps = math.ceil(z / LEAP)
         if leaps == 0:
             continue
-        if z <= 16 and (facts.uniform or len(gaps) > 1):
-            outputs = min(8, max(1, int(16 / z)), len(gaps) * repeats)
+        if z <= REACH and (facts.uniform or len(gaps) > 1):
+            outputs = min(LONGEST, max(1, int(REACH / z)), len(gaps) * repeats)
         else:
             outputs = 1
         whole = terms(z / leaps if leaps > 1 else z * outputs, accuracy)
@@ -291,7 +292,9 @@ def _chebyshev(method: str, facts: Facts, options: dict[str, Any], dtype: torch.
     cut = facts.reach is not None and facts.reach.pays(fused)
     whole_chain = facts.n if cut else facts.scene.n_particles
     if cut and fused:  # the check
-        stencils, sums = (work + math.ceil(limit * facts.end / 256) * terms(256, accuracy) for work in (stencils, sums))
+        stencils, sums = (
+            work + math.ceil(limit * facts.end / LEAP) * terms(LEAP, accuracy) for work in (stencils, sums)
+        )
     size = facts.moving(longest / 2)
     spent = facts.rows * (size * (stencils * machine.stencil + sums * machine.sum) + orders * machine.order)
     spent += facts.rows * (stencils / 4 * machine.pass_call + whole_chain * machine.scratch)

@@ -31,8 +31,10 @@ class Moments:
         """The moments of both sets (Chan, Golub and LeVeque 1983)."""
         count = self.count + other.count
         difference = other.mean - self.mean
-        mean = self.mean + difference * (other.count / count)
-        squares = self.squares + other.squares + difference * difference * (self.count * other.count / count)
+        mean = torch.add(self.mean, difference, alpha=other.count / count)
+        squares = torch.addcmul(self.squares, difference, difference, value=self.count * other.count / count)
+        if other.count > 1:
+            squares += other.squares
         return Moments(count, mean, squares)
 
 
@@ -87,7 +89,7 @@ class MomentTree:
             if start % 2:
                 left = self.waiting.pop((level, start - 1), None)
                 if left is None:
-                    self.waiting[level, start] = (mean.pop(0).clone(), squares.pop(0))
+                    self.waiting[level, start] = (mean.pop(0), squares.pop(0))
                     start += 1
                 else:
                     mean, squares, start = [left[0], *mean], [left[1], *squares], start - 1
@@ -95,7 +97,7 @@ class MomentTree:
                 last = start + len(mean) - 1
                 right = self.waiting.pop((level, last + 1), None)
                 if right is None:
-                    self.waiting[level, last] = (mean.pop().clone(), squares.pop())
+                    self.waiting[level, last] = (mean.pop(), squares.pop())
                 else:
                     mean, squares = [*mean, right[0]], [*squares, right[1]]
             pairs = range(0, len(mean), 2)
@@ -103,6 +105,11 @@ class MomentTree:
             mean, squares = [m for m, _ in merged], [s for _, s in merged]
             level, start = level + 1, start // 2
         self._close()
+        # A leaf that still waits must not hold, or be changed with, the tensor that it came in.
+        for place in {(0, first), (0, first + len(values) - 1)} & self.waiting.keys():
+            self.waiting[place] = self.waiting[place][0].clone(), None
+        if self.whole is not None and self.whole.count == 1:
+            self.whole = Moments(1, self.whole.mean.clone(), self.whole.squares)
 
     def absorb(self, other: MomentTree) -> None:
         """Take in the realizations of another tree, which is used up."""
@@ -262,7 +269,8 @@ def _merge_equal(
 ) -> tuple[Tensor, Tensor]:
     """Mean and squares of two nodes of ``count`` realizations each."""
     difference = other_mean - mean
-    total = difference.square().mul_(count / 2)
-    if squares is not None and other_squares is not None:
-        total = (squares + other_squares).add_(total)
-    return difference.div_(2).add_(mean), total
+    if squares is None or other_squares is None:
+        total = difference.square().mul_(count / 2)
+    else:
+        total = (squares + other_squares).addcmul_(difference, difference, value=count / 2)
+    return torch.add(mean, difference, alpha=0.5, out=difference), total

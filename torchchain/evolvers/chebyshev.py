@@ -20,6 +20,8 @@ kernels of :mod:`stencil` do the same.
 
 from __future__ import annotations
 
+import math
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,11 +35,15 @@ from torchchain.evolvers.method import Advance, Method, Trajectory
 from torchchain.excitation import State
 
 if TYPE_CHECKING:
-    from torchchain.evolvers.stencil import Rows
+    from torchchain.evolvers.stencil import March, Rows
 
 # A stretch of time with z beyond this is crossed in equal leaps. Longer ones save little, as the degree is z / 2 and a
 # few, while rounding errors of the recursion grow with its degree.
 LEAP = 256.0
+# The outputs that follow a state until z exceeds REACH, at most LONGEST, share the kernels' recursion: the work per
+# output, degree(z) stencils for all of them plus two sums each, is flat around this minimum.
+REACH = 24.0
+LONGEST = 8
 SEGMENTS = 1024
 SWEEPS = 8  # of the bound's power iteration: within 2 % of the highest frequency, or of 30 sweeps
 ROUNDING = 2.0**-53
@@ -290,7 +296,8 @@ class CompiledAdvance:
         contacts = chain.contact_stiffness
         if chain.boundary == "periodic":
             contacts = torch.cat([contacts, contacts[..., :1]], dim=-1)
-        masses, displacement, springs = plain(chain.masses), plain(state.displacement), plain(contacts)
+        masses, springs = plain(chain.masses), plain(contacts)
+        states = torch.stack([state.displacement.detach(), state.velocity.detach()], dim=-2)
         periodic = chain.boundary == "periodic"
         squared = np.empty(len(masses))
         if bound is None:
@@ -304,15 +311,19 @@ class CompiledAdvance:
             masses=masses,
             contacts=springs,
             frequencies=_rounded_up(np.sqrt(squared)),
-            displacement=displacement,
-            velocity=plain(state.velocity),
-            starts=len(displacement) // len(masses),
+            states=states.double().reshape(-1, 2, n).numpy(),
+            starts=math.prod(state.displacement.shape[:-1]) // len(masses),
             periodic=periodic,
             tolerance=tolerance,
         )
-        self._march = stencil.March(self.rows)
         self._shape, self._n, self._dtype = state.displacement.shape[:-1], n, state.displacement.dtype
         self._now = 0.0
+
+    @cached_property
+    def _march(self) -> March:
+        from torchchain.evolvers import stencil
+
+        return stencil.March(self.rows)
 
     def check_work(self, times: Tensor) -> None:
         """See :func:`check_work`."""

@@ -29,22 +29,19 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
+from numba import njit, types
+from numba.extending import intrinsic
 
-from torchchain.evolvers.chebyshev import LEAP
+from torchchain.evolvers.chebyshev import LEAP, LONGEST, REACH
 
 # What a march leaves behind at every output time; the fields are those whose transforms make the energy of a
 # wavenumber. Kinds 3 and up write as many fields as they name.
 STATES, SITE_MOMENTS, BOND_MOMENTS, UNIFORM_FIELDS, SITE_FIELDS, BOND_FIELDS = range(6)
 
-# A segment ends before z exceeds REACH or the outputs exceed LONGEST: the work per output, degree(z) stencils shared
-# by the segment plus two sums per output, is flat around this minimum (a sum costs a sixth of a stencil).
-REACH = 16.0
-LONGEST = 8
 # The mirrored form adds up rounding errors like a random walk's integral; a plain step now and then ends that.
 RESTART = 64
 # Dropped at the edges of the active window: energy norm below half an ulp of the whole chain's.
@@ -57,6 +54,22 @@ _RING = 6  # rows of T_k alive at a time: four that are summed together and the 
 _kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 _summing_kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
+
+def _widen(typing_context):
+    """Lets LLVM take the widest vectors there are in the function that calls this and in what is inlined there.
+
+    It prefers half of that on processors with 512 bits, as short loops gain nothing; these are long, and gain a
+    tenth and more. It is a function's own attribute: other code that Numba compiles is left alone.
+    """
+
+    def generate(context, builder, signature, arguments):
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')  # llvmlite's own add knows no such pairs
+        return context.get_dummy_value()
+
+    return types.none(), generate
+
+
+_wide_vectors: Any = intrinsic(_widen)
 
 # Rows of the scratch are reached as offsets into one flat array, and indices are unsigned: signed ones make Numba
 # test for a negative index at every load, which keeps the loops from being vectorized.
@@ -74,6 +87,7 @@ def _aligned(size):
 @_kernel
 def _first(w, middle, new, left, right, n):
     """T_1 = x T_0 on n particles."""
+    _wide_vectors()
     b, c, f, g, one = _U(middle), _U(new), _U(left), _U(right), _U(1)
     for i in range(_U(n)):
         x = w[b + i]
@@ -83,6 +97,7 @@ def _first(w, middle, new, left, right, n):
 @_kernel
 def _next(w, old, middle, new, left, right, n):
     """T_k+1 = 2 x T_k - T_k-1 on n particles; differences first, so that a translation stays one exactly."""
+    _wide_vectors()
     a, b, c, f, g, one = _U(old), _U(middle), _U(new), _U(left), _U(right), _U(1)
     for i in range(_U(n)):
         x = w[b + i]
@@ -92,6 +107,7 @@ def _next(w, old, middle, new, left, right, n):
 @_kernel
 def _next_even(w, old, middle, new, left, n):
     """:func:`_next` where both contacts of every particle are equally stiff."""
+    _wide_vectors()
     a, b, c, f, one = _U(old), _U(middle), _U(new), _U(left), _U(1)
     for i in range(_U(n)):
         x = w[b + i]
@@ -101,6 +117,7 @@ def _next_even(w, old, middle, new, left, n):
 @_kernel
 def _add_four(w, u, v, row0, row1, row2, row3, for_u, for_v, j, k, n):
     """Four terms of the sums for the displacement and velocity of one output."""
+    _wide_vectors()
     c0, c1, c2, c3 = for_u[j, k], for_u[j, k + 1], for_u[j, k + 2], for_u[j, k + 3]
     d0, d1, d2, d3 = for_v[j, k], for_v[j, k + 1], for_v[j, k + 2], for_v[j, k + 3]
     p, q, a, b, c, d = _U(u), _U(v), _U(row0), _U(row1), _U(row2), _U(row3)
@@ -111,8 +128,21 @@ def _add_four(w, u, v, row0, row1, row2, row3, for_u, for_v, j, k, n):
 
 
 @_kernel
+def _add_two(w, u, v, row0, row1, for_u, for_v, j, k, n):
+    """The same for two terms."""
+    _wide_vectors()
+    c0, c1, d0, d1 = for_u[j, k], for_u[j, k + 1], for_v[j, k], for_v[j, k + 1]
+    p, q, a, b = _U(u), _U(v), _U(row0), _U(row1)
+    for i in range(_U(n)):
+        t0, t1 = w[a + i], w[b + i]
+        w[p + i] = w[p + i] + c0 * t0 + c1 * t1
+        w[q + i] = w[q + i] + d0 * t0 + d1 * t1
+
+
+@_kernel
 def _first_four(w, u, v, row0, row1, row2, row3, for_u, for_v, j, keep_u, keep_v, n):
     """Terms 0 to 3; what the output's rows held is kept with the factors 0, 1 or -1."""
+    _wide_vectors()
     c0, c1, c2, c3 = for_u[j, 0], for_u[j, 1], for_u[j, 2], for_u[j, 3]
     d0, d1, d2, d3 = for_v[j, 0], for_v[j, 1], for_v[j, 2], for_v[j, 3]
     p, q, a, b, c, d = _U(u), _U(v), _U(row0), _U(row1), _U(row2), _U(row3)
@@ -125,6 +155,7 @@ def _first_four(w, u, v, row0, row1, row2, row3, for_u, for_v, j, keep_u, keep_v
 @_summing_kernel
 def _moments_site(w, u, v, mass, contact, reference, first, n):
     """Sums of E, q E and q^2 E over n particles, E of Eq. 36 and q the particle number minus the reference."""
+    _wide_vectors()
     p, s, b, k, one = _U(u), _U(v), _U(mass), _U(contact), _U(1)
     total, center, width = 0.0, 0.0, 0.0
     q = first - reference
@@ -141,6 +172,7 @@ def _moments_site(w, u, v, mass, contact, reference, first, n):
 @_summing_kernel
 def _moments_bond(w, u, v, mass, contact, reference, first, n):
     """The same with E of Eq. A3; the other half of a wall contact is added by the caller."""
+    _wide_vectors()
     p, s, b, k, one = _U(u), _U(v), _U(mass), _U(contact), _U(1)
     total, center, width = 0.0, 0.0, 0.0
     q = first - reference
@@ -193,7 +225,7 @@ def _coefficients(frequency, time, tolerance, bessel, cosine, drift, slope):
     Terms are dropped while the sums of |c_k|, W |s_k| and |d_k| / W over all that are dropped stay within the
     tolerance: summed over the Bessel functions themselves, which above the order z are positive and fall faster
     than geometrically. As |T_k| <= 1 on the spectrum, these sums bound the error in the mass norm of W u and of v.
-    The number is rounded up to a multiple of four. The first coefficient of each kind is then set so that a
+    The number is even and at least four. The first coefficient of each kind is then set so that a
     translation of the whole chain, on which every T_k is 1, moves exactly: c = 1, s = time, d = 0.
     """
     z = frequency * time
@@ -215,7 +247,7 @@ def _coefficients(frequency, time, tolerance, bessel, cosine, drift, slope):
             cosine[k] = 2 * values[2 * k]
             drift[k] = 4 * odd / frequency
             slope[k] = frequency * difference
-    terms = min(4 * ((terms + 3) // 4), cosine.size)
+    terms = min(max(4, 2 * ((terms + 1) // 2)), cosine.size)
     rest_cosine, rest_drift, rest_slope = 0.0, 0.0, 0.0
     for k in range(terms - 1, 0, -1):
         rest_cosine += cosine[k]
@@ -280,7 +312,7 @@ def _expand(w, row, source, low, high, count, u, v, terms, for_u, for_v, keep_u,
                 _clear(w, at + before_stop, at + stop + 1)
                 if full:
                     _close(w, row, at)
-        for q in range(max(k, 1), k + 4):
+        for q in range(max(k, 1), min(k + 4, most)):
             new = row.ring[q % _RING]
             middle = source if q == 1 else row.ring[(q - 1) % _RING]
             old = source if q == 2 else row.ring[(q - 2) % _RING]
@@ -302,8 +334,10 @@ def _expand(w, row, source, low, high, count, u, v, terms, for_u, for_v, keep_u,
         for j in range(count):
             if k == 0:
                 _first_four(w, u[j] + start, v[j] + start, t0, t1, t2, t3, for_u, for_v, j, keep_u, keep_v, size)
-            elif k < terms[j]:
+            elif k + 2 < terms[j]:
                 _add_four(w, u[j] + start, v[j] + start, t0, t1, t2, t3, for_u, for_v, j, k, size)
+            elif k < terms[j]:
+                _add_two(w, u[j] + start, v[j] + start, t0, t1, for_u, for_v, j, k, size)
     return start, stop
 
 
@@ -329,6 +363,8 @@ def _trim(w, row, u, v, used, stiff, limit, low, high):
         start += 1
     while start < stop and _quiet(w, row, u, v, used, stiff, stop - 1, limit):
         stop -= 1
+    if start == low and stop == high:
+        return start, stop
     for j in range(u.size):
         for at in (u[j], v[j]):
             _clear(w, at + low, at + start)
@@ -406,6 +442,7 @@ def _record_moments(w, row, u, v, kind, low, high, reference, out):
 @_kernel
 def _record_fields(w, row, u, v, kind, out, r, i):
     """Leaves one state, or the fields that make up its energy in wavenumber space, in out[:, r, i]."""
+    _wide_vectors()
     # One field a loop: with more pointers in one, the compiler gives up proving that they are apart.
     n, one = _U(row.n), _U(1)
     p, s, b, k = _U(u), _U(v), _U(row.mass), _U(row.contact)
@@ -541,7 +578,8 @@ def march(
             are equal within rounding as equal. Without it the states do not depend on how the times are cut into
             calls, to the last bit.
         kind: STATES to BOND_FIELDS.
-        anchors, latest: states (row, 2, particle) at the last anchor and at the last time, updated.
+        anchors, latest: states (row, 2, particle) at the last anchor and at the last time, updated unless ``latest``
+            is empty, when these times are the only ones.
         clock: (row, 4): time of the anchor, times since it, last time, and twice the energy at the start (negative
             while unknown), updated.
         fields: (field, row - first, time, particle), written if the kind is one of states or fields.
@@ -650,6 +688,8 @@ def march(
                 else:
                     _record_fields(w, row, u[at], v[at], kind, fields, r - first, i + j)
             i += count
+        if latest.size == 0:
+            continue
         anchors[r, 0], anchors[r, 1] = w[u[0] : u[0] + n], w[v[0] : v[0] + n]
         latest[r, 0], latest[r, 1] = w[u[here] : u[here] + n], w[v[here] : v[here] + n]
         clock[r, 0], clock[r, 1], clock[r, 2] = anchor, since, times[steps - 1]
@@ -687,27 +727,31 @@ def squared_bounds(begin, end, masses, contacts, periodic, sweeps, bounds):
 
 
 @_summing_kernel
-def bin_spectra(a, b, c, d, kind, strain, normalize, bands, totals):
+def bin_spectra(spectra, kind, strain, normalize, row, time, bands, totals):
     """Energies of wavenumbers (Eq. 43) summed into bands (Eq. 44).
 
     Args:
-        a, b, c, d: transforms of the fields that :func:`march` leaves, without a factor, (row, time, 2 (N/2 + 1)): the
-            real and the imaginary part of each wavenumber in turn. Those that the kind has not are not looked at.
+        spectra: transforms of the fields that :func:`march` leaves, without a factor, (field, row, time,
+            2 (N/2 + 1)): the real and the imaginary part of each wavenumber in turn.
         kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS.
         strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, (wavenumber,).
         normalize: divide by the total.
+        row, time: where in the results the spectra belong.
         bands: (row, time, band), written.
         totals: energy of all wavenumbers, k = 0 among them, (row, time), written.
     """
-    size, n_bands = a.shape[2], bands.shape[2]
+    _wide_vectors()
+    count, size, n_bands = spectra.shape[0], spectra.shape[3], bands.shape[2]
     width = (size - 2) // n_bands
     # 1/2 for the energy and 1/N for the unitary transform; k and -k are two, except where they are one.
     scale = 1.0 / (size - 2)
     energy = np.empty(size)
     strains = np.repeat(strain, 2)
-    for r in range(a.shape[0]):
-        for i in range(a.shape[1]):
-            p, q, s, t = a[r, i], b[r, i], c[r, i], d[r, i]
+    for r in range(spectra.shape[1]):
+        for i in range(spectra.shape[2]):
+            p, q = spectra[0, r, i], spectra[1, r, i]
+            s, t = spectra[min(2, count - 1), r, i], spectra[min(3, count - 1), r, i]
+            out = bands[row + r, time + i]
             if kind == UNIFORM_FIELDS:
                 for k in range(size):
                     energy[k] = p[k] * q[k] + strains[k] * s[k] * s[k]
@@ -725,12 +769,12 @@ def bin_spectra(a, b, c, d, kind, strain, normalize, bands, totals):
                 start = _U(2 + band * width)
                 for k in range(_U(width)):
                     part += energy[start + k]
-                bands[r, i, band] = part
+                out[band] = part
                 total += part
             factor = 1.0 / total if normalize else scale
             for band in range(n_bands):
-                bands[r, i, band] *= factor
-            totals[r, i] = total * scale
+                out[band] *= factor
+            totals[row + r, time + i] = total * scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -741,7 +785,7 @@ class Rows:
         masses: (realization, particle), float64.
         contacts: (realization, N + 1), float64; on a ring the last contact is the first again.
         frequencies: W, (realization,), float64.
-        displacement, velocity: (row, particle), float64; row r starts realization r // starts.
+        states: displacement and velocity, (row, 2, particle), float64; row r starts realization r // starts.
         starts: rows per realization.
         periodic: whether the chains are rings.
         tolerance: largest sum of dropped coefficients in a segment.
@@ -750,15 +794,14 @@ class Rows:
     masses: np.ndarray
     contacts: np.ndarray
     frequencies: np.ndarray
-    displacement: np.ndarray
-    velocity: np.ndarray
+    states: np.ndarray
     starts: int
     periodic: bool
     tolerance: float
 
     @property
     def count(self) -> int:
-        return len(self.displacement)
+        return len(self.states)
 
 
 class March:
@@ -767,13 +810,14 @@ class March:
     Args:
         rows: chains and starts.
         mirrored: see :func:`march`.
+        once: there will be no second window, and nothing is kept for it.
     """
 
-    def __init__(self, rows: Rows, mirrored: bool = False) -> None:
+    def __init__(self, rows: Rows, mirrored: bool = False, once: bool = False) -> None:
         self.rows = rows
         self.mirrored = mirrored
-        self.anchors = np.stack([rows.displacement, rows.velocity], axis=1)
-        self.latest = np.zeros_like(self.anchors)
+        self.anchors = rows.states if once else rows.states.copy()
+        self.latest = np.empty_like(rows.states[:0] if once else rows.states)
         self.clock = np.zeros((rows.count, 4))
         self.clock[:, 3] = -1
 
