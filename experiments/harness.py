@@ -25,6 +25,7 @@ from torch import Tensor
 import torchchain as tc
 from torchchain import checks, outputs
 from torchchain.scene import read_toml, regular_times
+from torchchain.statistics import jackknife_error
 
 TIME = {"units": "travel time of sound over one particle", "long_name": "time t"}
 RATE = {"units": "1 / travel time of sound over one particle"}
@@ -291,4 +292,4 @@ def jackknife(
     if n < 2:
         return value, torch.full_like(value, torch.nan)
     left_out = torch.stack([statistic(mean(every[every % n != group])) for group in range(n)])
-    return value, ((n - 1) / n * (left_out - left_out.mean(0)).square().sum(0)).sqrt()
+    return value, jackknife_error(left_out)

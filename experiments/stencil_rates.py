@@ -91,7 +91,7 @@ def rates(config: Config, n: int) -> dict[str, list[float]]:
     chain = tc.Chain(tc.Disorder(strength=config.strength).masses(n, 1, config.seed), "fixed")
     # A start of displacement and velocity everywhere, carried over one long time: every stencil is full.
     generator = torch.Generator().manual_seed(config.seed)
-    state = tc.State(*(torch.randn(1, n, generator=generator, dtype=torch.float64) for _ in range(2)))
+    state = tc.State(*(1e-3 * torch.randn(1, n, generator=generator, dtype=torch.float64) for _ in range(2)))
     copies = config.eager_chains
     batch = tc.Chain(chain.masses.repeat(copies, 1), "fixed")
     many = tc.State(state.displacement.repeat(copies, 1), state.velocity.repeat(copies, 1))
@@ -121,6 +121,22 @@ def rates(config: Config, n: int) -> dict[str, list[float]]:
         }
 
 
+def impulse_updates(config: Config, frequency: float) -> tuple[float, float]:
+    """Particles times stencils, and particles times terms of the sums for outputs, of one chain after the kick.
+
+    No more particles are counted than sound has reached, though the kernels go a little beyond.
+    """
+    count = min(chebyshev.LONGEST, int(chebyshev.REACH / frequency))
+    terms = np.array(
+        [
+            stencil._coefficients(frequency, 1.0 + j, chebyshev.ROUNDING, np.empty(1000), *np.empty((3, 1000)))
+            for j in range(count)
+        ]
+    )
+    reached = np.minimum(np.arange(0, config.stop, count), config.n_particles).sum()
+    return reached * terms.max(), reached * 2 * terms.sum()
+
+
 def measure(config: Config, device: str) -> xarray.Dataset:
     disorder = tc.Disorder(strength=config.strength)
     masses = disorder.masses(config.n_particles, max(config.realizations, config.modes_realizations), config.seed)
@@ -142,6 +158,8 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     kinds = list(speed[0])
     chains = {"kernels": config.realizations, "modes": config.modes_realizations}
     shared = min(chains.values())
+    counted = np.array([impulse_updates(config, w) for w in chebyshev.highest_frequency(many).tolist()]).mean(0)
+    spent = np.array(seconds["kernels"]) / config.realizations * torch.get_num_threads()
     (center, width), (modal_center, modal_width) = found["kernels"], found["modes"]
     # The width starts from zero: relative to it from the first output after the start.
     errors = [
@@ -160,6 +178,11 @@ def measure(config: Config, device: str) -> xarray.Dataset:
                 np.array([[t / chains[way] for t in seconds[way]] for way in seconds]),
                 {"units": "s", "long_name": "seconds per chain, all cores"},
             ),
+            "impulse_rate": (
+                ("work", "repeat"),
+                np.stack([counted[0] / spent, counted.sum() / spent]),
+                {"units": "1/s", "long_name": "updates per second of one core, impulse by the kernels"},
+            ),
             "error": (("quantity",), errors, {"long_name": "largest relative difference between the ways"}),
         },
         coords={
@@ -167,6 +190,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             "kind": kinds,
             "way": list(seconds),
             "quantity": ["center R", "width r^2"],
+            "work": ["stencils", "stencils and terms of sums"],
         },
     )
 
@@ -192,6 +216,9 @@ def compare(data: xarray.Dataset, config: Config) -> list[harness.Row]:
                 note=f"{values.min():.3g} to {values.max():.3g}",
             )
         )
+    for work in data.work.values:
+        rate = statistics.median(data.impulse_rate.sel(work=work).values / 1e9)
+        rows.append(harness.Row(f"impulse, kernels, {work}: 1e9 updates / s", rate))
     medians = data.impulse.median("repeat")
     rows.append(harness.Row("impulse, modes / kernels", float(medians.sel(way="modes") / medians.sel(way="kernels"))))
     for quantity in data.quantity.values:
@@ -228,7 +255,8 @@ def explain(data: xarray.Dataset, config: Config) -> str:
         "bare: the three-term recursion alone, in place. kernels: the same with what makes it a solution, the sums for\n"
         "displacement and velocity (two per update) and the rest of a call. eager torch: the same in plain tensor operations,\n"
         "many chains at once. impulse: center and width of the energy after a kick at site 1, by tc.energy_moments\n"
-        "and by batched eigen-decomposition, modal sums and particle_energy."
+        "and by batched eigen-decomposition, modal sums and particle_energy. Its rate counts the particles that sound has\n"
+        "reached: the sums for 1025 outputs are most of the work, and a term of one is an update as cheap as a stencil."
     )
 
 

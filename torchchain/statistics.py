@@ -62,6 +62,12 @@ def statistical_distance(stderr: Tensor) -> Tensor:
     return stderr.sum(-1) / math.sqrt(math.pi)
 
 
+def jackknife_error(replicates: Tensor) -> Tensor:
+    """Standard error of a statistic from its values with one block of data left out at a time, (...) from (block, ...)."""
+    count = len(replicates)
+    return ((replicates - replicates.mean(0)).square().sum(0) * (count - 1) / count).sqrt()
+
+
 class MomentTree:
     """Running moments of numbered realizations that come in any chunks and any order.
 

@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from torchchain import checks
+from torchchain.master.fits import checked_window
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import RateModel, SwingInModel, TransferModel
 from torchchain.master.trust import Uncertainty
@@ -169,7 +170,7 @@ def _member(where: str, header: dict[str, Any], tensors: dict[str, torch.Tensor]
         uncertainty = Uncertainty.from_tensors(**errors) if errors else None
         model = MODELS[header["kind"]](**tensors)
         scene = Scene.from_dict(header["scene"])
-        window = None if header["window"] is None else _window(header["window"])
+        window = None if header["window"] is None else checked_window(header["window"])
         report = header["report"]
         if report.get("horizon", "infinite") != "infinite":
             checks.number("report.horizon", report["horizon"], at_least=0)
@@ -278,10 +279,3 @@ def _model_tensors(
             raise checks.fail(where, f"hold {name} as 32 or 64 bit floating point", part.get_dtype())
         tensors[name] = file.get_tensor(prefix + name)
     return tensors
-
-
-def _window(value: list[Any]) -> tuple[float, float]:
-    if len(value) != 2:
-        raise checks.fail("window", "be two times", value)
-    begin = checks.number("window", value[0], at_least=0)
-    return begin, checks.number("window", value[1], above=begin)

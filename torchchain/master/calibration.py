@@ -17,7 +17,7 @@ from torchchain.ensemble import BandTransfer
 from torchchain.master import trust
 from torchchain.master.adam import AdamSettings
 from torchchain.master.equation import Calibration, MasterEquation
-from torchchain.master.fits import FitWarning, within
+from torchchain.master.fits import FitWarning, checked_window, within
 from torchchain.master.ladder import BASES, MODELS, Recipe, Sample, exact_basis, fit
 from torchchain.master.memory import LADDER, checked_order
 from torchchain.master.model import RateModel, TransferModel
@@ -67,7 +67,9 @@ def recipe(
     if order is not None:
         order = checked_order(order, len(scene.times))
         method, model = "projection", "memory"
-    window = _window(window, NONLINEAR_WINDOW if method == "nonlinear" else LINEAR_WINDOW)
+    if window is None:
+        window = NONLINEAR_WINDOW if method == "nonlinear" else LINEAR_WINDOW
+    window = checked_window(window)
     if not scene.is_ordered:
         within(scene.times, window, 4 if method == "nonlinear" else 2)
     return Recipe(method, model, window, AdamSettings(**settings), order)
@@ -236,15 +238,6 @@ def _ordered(transfer: BandTransfer, asked: Recipe) -> MasterEquation:
         asked.method or "linear", asked.model or "paper", asked.window, transfer.scene, {"ordered": True}
     )
     return MasterEquation(model, record)
-
-
-def _window(window: tuple[float, float] | None, default: tuple[float, float]) -> tuple[float, float]:
-    if window is None:
-        return default
-    if not isinstance(window, (tuple, list)) or len(window) != 2:
-        raise checks.FieldTypeError(f"window must be two times, got {checks.shown(window)}")
-    begin = checks.number("window", window[0], at_least=0)
-    return begin, checks.number("window", window[1], above=begin)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.ensemble import BandTransfer
-from torchchain.statistics import statistical_distance, total_variation
+from torchchain.statistics import jackknife_error, statistical_distance, total_variation
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def chapman_kolmogorov(
 
     measured, predicted = both(transfer.mean)
     differences = torch.stack([a - b for a, b in map(both, _without_one(transfer))])
-    return ChapmanKolmogorov(lag, transfer.times[places], measured, predicted, _jackknife_error(differences))
+    return ChapmanKolmogorov(lag, transfer.times[places], measured, predicted, jackknife_error(differences))
 
 
 def implied_timescales(transfer: BandTransfer, lags: Any) -> tuple[Tensor, Tensor]:
@@ -104,7 +104,7 @@ def implied_timescales(transfer: BandTransfer, lags: Any) -> tuple[Tensor, Tenso
 
     value = scales(transfer.mean)
     rates = torch.stack([1 / scales(mean) for mean in _without_one(transfer)])  # finite where scales are not
-    return value, value.square().nan_to_num(posinf=torch.inf) * _jackknife_error(rates)
+    return value, value.square().nan_to_num(posinf=torch.inf) * jackknife_error(rates)
 
 
 def _at(name: str, transfer: BandTransfer, time: float) -> int:
@@ -121,8 +121,3 @@ def _without_one(transfer: BandTransfer) -> list[Tensor]:
         raise checks.fail("transfer", "have at least 2 blocks of realizations", len(counts))
     whole = torch.einsum("b,bstr->str", counts, transfer.block_mean)
     return [(whole - n * part) / (counts.sum() - n) for n, part in zip(counts, transfer.block_mean, strict=True)]
-
-
-def _jackknife_error(replicates: Tensor) -> Tensor:
-    count = len(replicates)
-    return ((replicates - replicates.mean(0)).square().sum(0) * (count - 1) / count).sqrt()

@@ -18,6 +18,14 @@ class FitWarning(UserWarning):
     """Some entries of a fit did not converge."""
 
 
+def checked_window(window: tuple[float, float] | list[float]) -> tuple[float, float]:
+    """First and last time of a fit, if they are two times in order."""
+    if not isinstance(window, (tuple, list)) or len(window) != 2:
+        raise checks.FieldTypeError(f"window must be two times, got {checks.shown(window)}")
+    begin = checks.number("window", window[0], at_least=0)
+    return begin, checks.number("window", window[1], above=begin)
+
+
 def within(times: Tensor, window: tuple[float, float], at_least: int) -> Tensor:
     """Which times lie in the window; an error if fewer than ``at_least`` do."""
     inside = (times >= window[0] - 1e-9) & (times <= window[1] + 1e-9)
