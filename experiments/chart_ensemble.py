@@ -61,7 +61,7 @@ class Way:
     Attributes:
         observable: what is averaged.
         name: of the way.
-        opposite: also the ring with the opposite masses, quantile(1 - u) where one has quantile(u).
+        opposite: also the ring with the opposite masses, as ``Scene(opposite_pairs=True)`` draws them.
         starts: how many starts on each ring; for standing waves sine and cosine.
     """
 
@@ -90,10 +90,11 @@ def ways(config: Config) -> list[Way]:
 
 def drawn(config: Config, count: int, opposite: bool, stream: int) -> Tensor:
     """Masses of some draws, (draw, ring of the pair, particle)."""
+    size = 1 + opposite
+    numbers = range(stream * 2 * config.samples, stream * 2 * config.samples + count * size)
     disorder = tc.Disorder(strength=config.strength)
-    uniform = np.random.Generator(np.random.Philox(key=[config.seed, stream])).random((count, 1, config.n_particles))
-    both = np.concatenate([uniform, 1 - uniform], axis=1) if opposite else uniform
-    return torch.from_numpy(disorder._quantile(both.clip(2.0**-54, 1 - 2.0**-53)))
+    masses = disorder.masses(config.n_particles, numbers, config.seed, opposite_pairs=opposite)
+    return masses.unflatten(0, (count, size))
 
 
 def observed(config: Config, way: Way, masses: Tensor) -> Tensor:

@@ -418,6 +418,23 @@ def test_a_disk_that_fills_up_keeps_the_checkpoint(reference, tmp_path, monkeypa
     assert data_of(tmp_path / "out") == reference["simulate"]
 
 
+def test_pairs_are_resumed(tmp_path, monkeypatch):
+    scene = tc.Scene(
+        16, n_bands=4, realizations=26, times=[0.0, 3.0], opposite_pairs=True, observables=("band_energy",)
+    )
+    whole = tc.simulate(scene, "chebyshev", memory_budget=1)
+    checkpoint = Checkpoint(tmp_path, every=0)
+    with monkeypatch.context() as patch:
+        stopped_after(4, patch)
+        with pytest.raises(KeyboardInterrupt, match=r"(\d+) of 26 realizations") as caught:
+            tc.simulate(scene, "chebyshev", memory_budget=1, checkpoint=checkpoint)
+    again = Checkpoint(tmp_path, every=0)
+    assert equal(tc.simulate(scene, "chebyshev", memory_budget=1, checkpoint=again), whole)
+    assert again.resumed == int(str(caught.value).split()[1])
+    assert again.resumed >= 2
+    assert again.resumed % 2 == 0
+
+
 def test_nodes_go_through_files_unchanged(tmp_path):
     values = torch.randn(13, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     moments = ensemble.EnsembleMoments(13, 3)

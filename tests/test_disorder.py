@@ -55,6 +55,22 @@ def test_masses_do_not_depend_on_chunks_order_or_length():
     assert torch.equal(disorder.masses(40, 3, 5), whole[:3])
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_opposite_pairs(kind):
+    disorder = tc.Disorder(kind, 0.3, 0.0)
+    pairs = disorder.masses(50, 8, 5, opposite_pairs=True).reshape(4, 2, 50)
+    assert torch.equal(pairs[:, 0], disorder.masses(50, 4, 5))  # the plain realizations, and their opposites
+    if kind == "binary":
+        assert torch.allclose(pairs.sum(1), torch.full((4, 50), 2.0, dtype=torch.float64), rtol=0, atol=1e-15)
+        return
+    cut = distribution(kind, 0.3).cdf(0.0)  # 0 but for the normal distribution
+    ranks = (distribution(kind, 0.3).cdf(pairs.numpy()) - cut) / (1 - cut)
+    np.testing.assert_allclose(ranks.sum(1), 1, rtol=0, atol=1e-12)
+    contacts = disorder.stiffnesses(50, 8, 5, opposite_pairs=True)
+    assert torch.equal(contacts[0::2], disorder.stiffnesses(50, 4, 5))
+    assert torch.equal(disorder.masses(50, [3, 2], 5, opposite_pairs=True), pairs[1].flip(0))
+
+
 def test_seeds_realizations_and_streams_differ():
     disorder = tc.Disorder()
     drawn = torch.cat([disorder.masses(20, 3, 0), disorder.masses(20, 3, 1), disorder.stiffnesses(20, 3, 0)])

@@ -77,17 +77,17 @@ class Checkpoint:
         self.every = checks.number("checkpoint_every", every, at_least=0)
         self.resumed = 0
 
-    def read(self, identity: Mapping[str, Any], realizations: int, n_blocks: int) -> Kept:
+    def read(self, identity: Mapping[str, Any], realizations: int, n_blocks: int, sample_size: int = 1) -> Kept:
         """What earlier sessions of this run left, merged into one part.
 
         Args:
             identity: the run's settings, plain values.
-            realizations, n_blocks: of its :class:`EnsembleMoments`.
+            realizations, n_blocks, sample_size: of its :class:`EnsembleMoments`.
 
         Raises:
             FieldError: naming the first setting that differs from those of the folder.
         """
-        total = EnsembleMoments(realizations, n_blocks)
+        total = EnsembleMoments(realizations, n_blocks, sample_size)
         try:
             parts = self._parts()
         except OSError as error:
@@ -99,7 +99,7 @@ class Checkpoint:
         names = []
         for part in parts:
             try:
-                moments = EnsembleMoments.from_tensors(realizations, n_blocks, part.tensors)
+                moments = EnsembleMoments.from_tensors(realizations, n_blocks, part.tensors, sample_size)
                 _require_disjoint(total, moments)
             except (ValueError, KeyError) as error:
                 self._discard(part.path, str(error))

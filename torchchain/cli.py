@@ -92,6 +92,8 @@ class SceneFlags:
     """contact damping coefficient (default 0)"""
     energy_definition: str | None = None
     """site (default) or bond"""
+    opposite_pairs: bool | None = None
+    """draw chains in pairs of opposite masses: for means that change with the odd part of the disorder, such as widths"""
 
     def overrides(self) -> dict[str, Any]:
         """The flags that were given, as nested plain values."""

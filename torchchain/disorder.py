@@ -56,26 +56,39 @@ class Disorder:
         """Share of draws that fall below ``lower`` and are drawn again."""
         return 0.0 if self.strength < _NEGLIGIBLE else float(self._cumulative(np.float64(self.lower)))
 
-    def masses(self, n_particles: int, realizations: int | Iterable[int], seed: int) -> Tensor:
+    def masses(
+        self, n_particles: int, realizations: int | Iterable[int], seed: int, opposite_pairs: bool = False
+    ) -> Tensor:
         """Masses in units of the mean mass.
 
         Args:
             n_particles: particles per chain.
             realizations: how many, or the realization numbers themselves, counted from 0.
             seed: 0 to 2**64 - 1.
+            opposite_pairs: realizations 2 i and 2 i + 1 are realization i without this and its opposite, which has the
+                inverse distribution function of 1 - u where the first has that of u: light for heavy. What is odd in
+                the disorder cancels in the mean of a pair (antithetic variates: Hammersley and Morton 1956).
 
         Returns:
             (realization, particle), float64 on the CPU.
         """
-        return self._sample(checks.integer("n_particles", n_particles, 1, LARGEST_CHAIN), realizations, seed, _MASSES)
+        n_particles = checks.integer("n_particles", n_particles, 1, LARGEST_CHAIN)
+        return self._sample(n_particles, realizations, seed, opposite_pairs, _MASSES)
 
-    def stiffnesses(self, n_contacts: int, realizations: int | Iterable[int], seed: int) -> Tensor:
-        """Contact stiffnesses in units of the mean stiffness, (realization, contact), independent of the masses."""
-        return self._sample(
-            checks.integer("n_contacts", n_contacts, 1, LARGEST_CHAIN + 1), realizations, seed, _STIFFNESSES
-        )
+    def stiffnesses(
+        self, n_contacts: int, realizations: int | Iterable[int], seed: int, opposite_pairs: bool = False
+    ) -> Tensor:
+        """Contact stiffnesses in units of the mean stiffness, (realization, contact), independent of the masses.
 
-    def _sample(self, size: int, realizations: int | Iterable[int], seed: int, stream: int) -> Tensor:
+        Args: as for :meth:`masses`.
+        """
+        n_contacts = checks.integer("n_contacts", n_contacts, 1, LARGEST_CHAIN + 1)
+        return self._sample(n_contacts, realizations, seed, opposite_pairs, _STIFFNESSES)
+
+    def _sample(
+        self, size: int, realizations: int | Iterable[int], seed: int, opposite_pairs: bool, stream: int
+    ) -> Tensor:
+        checks.truth("opposite_pairs", opposite_pairs)
         seed = checks.integer("seed", seed, 0, 2**64 - 1)
         if checks.is_collection(realizations):
             numbers = [checks.integer("realizations", i, 0, 2**63) for i in realizations]
@@ -86,8 +99,11 @@ class Disorder:
         _require_room(size, len(numbers))
         uniform = np.empty((len(numbers), size))
         for row, i in enumerate(numbers):
-            bits = np.random.Philox(key=np.array([seed, i], dtype=np.uint64), counter=[0, 0, 0, stream])
+            draw = i // 2 if opposite_pairs else i
+            bits = np.random.Philox(key=np.array([seed, draw], dtype=np.uint64), counter=[0, 0, 0, stream])
             uniform[row] = (bits.random_raw(size) >> np.uint64(11)) + 0.5  # the middle of 2**53 equal cells
+            if opposite_pairs and i % 2:
+                uniform[row] = np.maximum(2.0**53 - uniform[row], 0.5)
         return torch.from_numpy(self._quantile(uniform * 2.0**-53))
 
     def _quantile(self, uniform: np.ndarray) -> np.ndarray:

@@ -290,15 +290,19 @@ def layout(
     footprint.check(scene, one, 1 if fused else window, BLOCKS + every.bit_length(), device)
     budget = footprint.memory(device) // 4 if memory_budget is None else memory_budget
     threads = torch.get_num_threads() if device.type == "cpu" else 1
+
+    def whole_samples(count: int) -> int:
+        return -(-count // scene.sample_size) * scene.sample_size
+
     if fused:
-        group = max(1, min(few, DECOMPOSED[device.type] // (64 * scene.n_particles**2)))
+        group = whole_samples(max(1, min(few, DECOMPOSED[device.type] // (64 * scene.n_particles**2))))
         points = max(1, len(scene.tones)) * scene.n_particles * max(len(scene.times), int(scene.times[-1]))
         workers = max(1, min(threads, wanted))
         half = -(-wanted // (2 * workers))  # two chunks a worker, for the progress bar
         size = max(1, min(half, CHUNK_WORK // points, budget // workers // (held + 2 * one.results)))
         return Layout(window, group, -(-size // group) * group, workers)
     few = max(1, min(few, together // scene.n_particles))  # masses of the whole chains
-    group = max(1, min(few, (one.matrices + together) // (held + 2 * one.results)))
+    group = whole_samples(max(1, min(few, (one.matrices + together) // (held + 2 * one.results))))
     chunk = group * (held + 2 * one.results)
     return Layout(window, group, group, max(1, min(threads, -(-wanted // group), budget // chunk)))
 
@@ -456,12 +460,13 @@ def ensemble_moments(
     Args:
         scene, method, options, device, stages, progress: see :func:`stream`.
         measure: from a chunk to the measurements called ``names``.
-        n_blocks: of consecutive realizations whose moments are kept apart.
+        n_blocks: of consecutive samples (realizations, or opposite pairs of them) whose moments are kept apart.
         checkpoint: keeps finished realizations, and those of an earlier run are not computed again.
         ranks: processes that share the realizations; each gets the result.
         settings: see :func:`stream`.
     """
     realizations = 1 if scene.is_ordered else scene.realizations
+    cut = realizations, n_blocks, scene.sample_size
     device, stages = checks.device("device", device), stages or Stages()
     checks.instance("options", options, dict, type(None))
     checks.choice("method", method, ("auto", *METHODS))
@@ -472,12 +477,12 @@ def ensemble_moments(
         "measured": list(names), "blocks": n_blocks, **scene.to_dict(),
         "method": method, "options": options or {}, "device": device.type,
     }  # fmt: skip
-    kept = Kept(EnsembleMoments(realizations, n_blocks))
+    kept = Kept(EnsembleMoments(*cut))
     begin: Any = None
     if ranks.rank == 0:
         try:
             if checkpoint is not None:
-                kept = checkpoint.read(identity, realizations, n_blocks)
+                kept = checkpoint.read(identity, *cut)
             plan = kept.plan
             if plan is None:
                 plan = dict(zip(("method", "options"), chosen(scene, method, names=names), strict=True))
@@ -489,7 +494,7 @@ def ensemble_moments(
         raise begin
     plan, session, missing = begin
     method, options = plan["method"], {**plan["options"], **(options or {})}
-    total = EnsembleMoments(realizations, n_blocks)
+    total = EnsembleMoments(*cut)
     writer = checkpoint.writer(session, ranks.rank, identity, plan) if checkpoint is not None else None
 
     def reduced(chunk: Chunk) -> EnsembleMoments:
@@ -497,7 +502,7 @@ def ensemble_moments(
         masses = chunk.chain.masses.cpu().numpy()  # NumPy sums each row by itself
         moments = np.stack([masses.mean(-1), np.square(masses).mean(-1)], axis=-1)
         measured["mass_moments"] = torch.from_numpy(moments)
-        part = EnsembleMoments(realizations, n_blocks)
+        part = EnsembleMoments(*cut)
         with chunk.stages("statistics"):
             part.add(chunk.first, measured)
         return part
@@ -660,7 +665,7 @@ class BandTransfer:
         long_time, long_time_stderr: infinite-time average, [source, receiver]; None if not asked for.
         block_mean: means over consecutive blocks of realizations, [block, source, time, receiver].
         block_long_time: [block, source, receiver], or None.
-        block_counts: realizations in each block.
+        block_counts: realizations (of opposite ones, pairs) in each block.
         attributes: realized mean and standard deviation of the masses, ``mass_mean`` and ``mass_sd``; the ``method`` that
             evolved the chains and, as JSON, its ``method_options``.
     """
@@ -812,8 +817,8 @@ def band_transfer(
     checks.truth("long_time", long_time)
     scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
     long_time = long_time and scene.damping == 0
-    realizations = 1 if scene.is_ordered else scene.realizations
-    n_blocks = min(BLOCKS, realizations)
+    samples = 1 if scene.is_ordered else scene.realizations // scene.sample_size
+    n_blocks = min(BLOCKS, samples)
 
     def measure(chunk: Chunk) -> dict[str, Tensor]:
         measured = chunk.observe(["band_energy"])

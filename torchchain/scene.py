@@ -62,6 +62,9 @@ class Scene:
         damping: contact damping coefficient.
         energy_definition: "site" (Eqs. 36, 42) or "bond" (Eq. A3).
         si: the beads in SI units, for results in seconds and meters; None to stay dimensionless.
+        opposite_pairs: draw realizations in pairs of opposite disorder (see :meth:`Disorder.masses`), each pair one
+            independent sample. It pays where an observable changes mostly with the odd part of the disorder, as the
+            squared width after a kick does, costs up to half more error where it does not, and never biases.
 
     Raises:
         FieldError, FieldTypeError: one line with the field, the rule and the value.
@@ -82,6 +85,7 @@ class Scene:
     damping: float = 0.0
     energy_definition: str = "site"
     si: Scaling | None = None
+    opposite_pairs: bool = False
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:
@@ -106,6 +110,9 @@ class Scene:
         checks.first_bad("times", f"be at most {LATEST_TIME:g}, where rounding blurs phases", self.times, late)
         if self.tolerance is not None:
             put("tolerance", checks.number("tolerance", self.tolerance, above=0, below=1))
+        put("opposite_pairs", checks.truth("opposite_pairs", self.opposite_pairs))
+        if self.realizations % self.sample_size:
+            raise checks.fail("realizations", "be even for opposite_pairs", self.realizations)
         checks.choice("contact", self.contact, (*CONTACTS, "auto"))
         put("damping", checks.number("damping", self.damping, at_least=0))
         checks.choice("energy_definition", self.energy_definition, ("site", "bond"))
@@ -143,6 +150,11 @@ class Scene:
         )
 
     @property
+    def sample_size(self) -> int:
+        """Realizations that make one independent sample: two where they come in opposite pairs."""
+        return 2 if self.opposite_pairs and not self.is_ordered else 1
+
+    @property
     def tones(self) -> tuple[int, ...]:
         """The tones of the standing waves, counted from 1; empty for an impulse."""
         if isinstance(self.excitation, Impulse):
@@ -154,11 +166,13 @@ class Scene:
     ) -> Chain:
         """The chains of the given realizations (counted from 0), masses (realization, particle)."""
         numbers = list(realizations)
-        masses = self.disorder.masses(self.n_particles, numbers, self.seed)
+        masses = self.disorder.masses(self.n_particles, numbers, self.seed, self.opposite_pairs)
         stiffness: float | Tensor = 1.0
         if self.stiffness_disorder is not None:
             n_contacts = self.n_particles + (self.boundary == "fixed")
-            stiffness = self.stiffness_disorder.stiffnesses(n_contacts, numbers, self.seed).to(device, dtype)
+            stiffness = self.stiffness_disorder.stiffnesses(n_contacts, numbers, self.seed, self.opposite_pairs).to(
+                device, dtype
+            )
         return Chain(masses.to(device, dtype), self.boundary, stiffness, self.contact, self.damping)
 
     def state(self, chain: Chain) -> State:

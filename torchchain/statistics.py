@@ -160,12 +160,14 @@ class EnsembleMoments:
     """Running moments of named measurements in blocks of consecutive realizations, from any chunks in any order.
 
     Args:
-        realizations: R, of the ensemble.
-        n_blocks: B, at most R; block b holds realizations R b / B (rounded down) to R (b + 1) / B - 1.
+        realizations: of the ensemble.
+        n_blocks: B, at most the number R of samples; block b holds samples R b / B (rounded down) to R (b + 1) / B - 1.
+        sample_size: consecutive realizations that make one independent sample, which is their mean.
     """
 
-    def __init__(self, realizations: int, n_blocks: int = 1) -> None:
-        self.edges = [realizations * block // n_blocks for block in range(n_blocks + 1)]
+    def __init__(self, realizations: int, n_blocks: int = 1, sample_size: int = 1) -> None:
+        self.sample_size = sample_size
+        self.edges = [realizations // sample_size * block // n_blocks for block in range(n_blocks + 1)]
         self.trees: dict[tuple[str, int], MomentTree] = {}
 
     def _tree(self, name: str, block: int) -> MomentTree:
@@ -173,8 +175,11 @@ class EnsembleMoments:
         return self.trees.setdefault((name, block), MomentTree(size))
 
     def add(self, first: int, measured: Mapping[str, Tensor]) -> None:
-        """Take in measurements (realization, ...) of realizations first, first + 1, ..."""
+        """Take in measurements (realization, ...) of realizations first, first + 1, ..., of whole samples."""
+        first //= self.sample_size
         for name, values in measured.items():
+            if self.sample_size > 1:
+                values = values.unflatten(0, (-1, self.sample_size)).mean(1)
             for block, (low, high) in enumerate(zip(self.edges, self.edges[1:], strict=False)):
                 begin, end = max(low, first), min(high, first + len(values))
                 if begin < end:
@@ -198,7 +203,8 @@ class EnsembleMoments:
         found: dict[str, list[range]] = {}
         for (name, block), tree in self.trees.items():
             low = self.edges[block]
-            found.setdefault(name, []).extend(range(low + r.start, low + r.stop) for r in tree.held())
+            size = self.sample_size
+            found.setdefault(name, []).extend(range(size * (low + r.start), size * (low + r.stop)) for r in tree.held())
         ranges = [joined(parts) for parts in found.values()]
         if any(other != ranges[0] for other in ranges):
             raise ValueError("the measurements differ in their realizations")
@@ -218,13 +224,15 @@ class EnsembleMoments:
         return plain
 
     @classmethod
-    def from_tensors(cls, realizations: int, n_blocks: int, plain: Mapping[str, Tensor]) -> EnsembleMoments:
+    def from_tensors(
+        cls, realizations: int, n_blocks: int, plain: Mapping[str, Tensor], sample_size: int = 1
+    ) -> EnsembleMoments:
         """The inverse of :meth:`tensors`.
 
         Raises:
             ValueError, KeyError: for names or realizations that :meth:`tensors` does not give.
         """
-        moments = cls(realizations, n_blocks)
+        moments = cls(realizations, n_blocks, sample_size)
         for key, mean in plain.items():
             name, block, *place, kind = key.split("/")
             if kind != "mean":

@@ -63,7 +63,9 @@ def _widen(typing_context):
     """
 
     def generate(context, builder, signature, arguments):
-        set.add(builder.function.attributes, '"prefer-vector-width"="512"')  # llvmlite's own add knows no such pairs
+        attributes = builder.function.attributes
+        if isinstance(attributes, set):  # whose own add, in llvmlite, knows no such pairs
+            set.add(attributes, '"prefer-vector-width"="512"')
         return context.get_dummy_value()
 
     return types.none(), generate
