@@ -10,7 +10,7 @@ import xarray
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.ensemble import Stages, layout, stream
-from torchchain.scene import OBSERVABLES
+from torchchain.scene import OBSERVABLES, describe
 
 TIMES = [0.0, 0.7, 5.0, 90.0]
 
@@ -218,6 +218,7 @@ def test_pairs_take_far_fewer_chains_for_a_width():
 def test_pairs_need_an_even_number():
     with pytest.raises(FieldError, match="realizations must be even for opposite_pairs, got 5"):
         tc.Scene(realizations=5, opposite_pairs=True)
+    assert "14 periodic chains in opposite pairs, N = 16" in describe(tc.Scene(**PAIRED))
     with pytest.raises(FieldTypeError, match="opposite_pairs must be True or False"):
         tc.Scene(opposite_pairs=1)
     ordered = tc.Scene(**{**COMMON, "disorder": tc.Disorder(strength=0)}, opposite_pairs=True)

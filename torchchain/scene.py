@@ -335,7 +335,8 @@ def describe(scene: Scene) -> str:
         else f"{len(scene.tones)} standing waves"
     )
     end = np.format_float_positional(float(scene.times[-1]), trim="-")
+    pairs = " in opposite pairs" if scene.sample_size == 2 else ""
     return (
-        f"{scene.realizations} {scene.boundary} chains, N = {scene.n_particles}, xi = {scene.disorder.strength:g}, "
+        f"{scene.realizations} {scene.boundary} chains{pairs}, N = {scene.n_particles}, xi = {scene.disorder.strength:g}, "
         f"{wave}, {len(scene.times)} times to {end}"
     )
