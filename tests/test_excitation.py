@@ -108,3 +108,13 @@ def test_states_follow_the_chain():
 def test_bad_values(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+def test_a_batch_of_waves_may_be_changed_chain_by_chain():
+    chain = tc.Chain(tc.Disorder().masses(8, 3, 0))
+    state = tc.standing_wave(chain, [1, 2])
+    before = state.displacement.clone()
+    state.displacement[1, 0, 4] = 7.0
+    state.velocity[1, 0, 4] = 7.0
+    assert torch.equal(state.displacement[[0, 2]], before[[0, 2]])
+    assert float(state.velocity.sum()) == 7.0

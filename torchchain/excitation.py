@@ -69,9 +69,14 @@ def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float 
         phase: "sin" or "cos". The sine of tone N/2 vanishes at every particle and is an error.
 
     Returns:
-        State (*batch, particle), or (*batch, tone, particle) for a sequence; the batch shares one wave in memory, so
-        clone it before a change in place.
+        State (*batch, particle), or (*batch, tone, particle) for a sequence.
     """
+    shared = _shared_wave(chain, tone, amplitude, phase)
+    return State(shared.displacement.clone(), shared.velocity.clone())
+
+
+def _shared_wave(chain: Chain, tone: int | Sequence[int], amplitude: float, phase: str) -> State:
+    """:func:`standing_wave` with one wave in memory for the whole batch."""
     checks.instance("chain", chain, Chain)
     n = chain.n_particles
     several = checks.is_collection(tone)
@@ -159,4 +164,4 @@ class StandingWave:
 
     def state(self, chain: Chain) -> State:
         assert self.tones is not None, "a scene resolves its tones first"
-        return standing_wave(chain, self.tones, self.amplitude, self.phase)
+        return _shared_wave(chain, self.tones, self.amplitude, self.phase)
