@@ -86,6 +86,11 @@ def in_turn(
     return seconds
 
 
+def terms_at(frequency: float, time: float) -> int:
+    """Terms of the expansion that the kernels take for one time, to rounding."""
+    return stencil._coefficients(frequency, time, chebyshev.ROUNDING, np.empty(1000), *np.empty((3, 1000)))
+
+
 def rates(config: Config, n: int) -> dict[str, list[float]]:
     """Stencil updates per second of one core's time, each run of each way."""
     chain = tc.Chain(tc.Disorder(strength=config.strength).masses(n, 1, config.seed), "fixed")
@@ -96,9 +101,7 @@ def rates(config: Config, n: int) -> dict[str, list[float]]:
     batch = tc.Chain(chain.masses.repeat(copies, 1), "fixed")
     many = tc.State(state.displacement.repeat(copies, 1), state.velocity.repeat(copies, 1))
     frequency = chebyshev.highest_frequency(chain).item()
-    terms = stencil._coefficients(
-        frequency, chebyshev.LEAP / frequency, chebyshev.ROUNDING, np.empty(1000), *np.empty((3, 1000))
-    )
+    terms = terms_at(frequency, chebyshev.LEAP / frequency)
     leaps = max(1, round(config.updates / (2 * terms * n)))
     fewer = max(1, leaps // copies)
     pairs = leaps * terms
@@ -127,12 +130,7 @@ def impulse_updates(config: Config, frequency: float) -> tuple[float, float]:
     No more particles are counted than sound has reached, though the kernels go a little beyond.
     """
     count = min(chebyshev.LONGEST, int(chebyshev.REACH / frequency))
-    terms = np.array(
-        [
-            stencil._coefficients(frequency, 1.0 + j, chebyshev.ROUNDING, np.empty(1000), *np.empty((3, 1000)))
-            for j in range(count)
-        ]
-    )
+    terms = np.array([terms_at(frequency, 1.0 + j) for j in range(count)])
     reached = np.minimum(np.arange(0, config.stop, count), config.n_particles).sum()
     return reached * terms.max(), reached * 2 * terms.sum()
 

@@ -99,7 +99,7 @@ class Checkpoint:
         names = []
         for part in parts:
             try:
-                moments = EnsembleMoments.from_tensors(realizations, n_blocks, part.tensors, sample_size)
+                moments = total.again(part.tensors)
                 _require_disjoint(total, moments)
             except (ValueError, KeyError) as error:
                 self._discard(part.path, str(error))

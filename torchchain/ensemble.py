@@ -282,7 +282,7 @@ def layout(
         for each in (scene, part.scene(scene) if part else scene)
     )
     one = replace(inside, results=whole.results)
-    every = 1 if scene.is_ordered else scene.realizations
+    every = scene.distinct_realizations
     wanted = every if realizations is None else realizations
     together, few = TOGETHER[device.type], max(1, every // GROUPS)
     window = len(scene.times) if fused else min(len(scene.times), max(1, together // one.state))
@@ -357,7 +357,7 @@ def stream(
     stages = stages or Stages()
     check_amplitude(scene)
     if numbers is None:
-        numbers = [range(1 if scene.is_ordered else scene.realizations)]
+        numbers = [range(scene.distinct_realizations)]
     wanted = sum(map(len, numbers))
     plan = layout(scene, method, names, device, wanted, memory_budget)
     times, part = scene.times.to(device), reach(scene)
@@ -373,7 +373,7 @@ def stream(
         with single_thread():
             return numbers, measure(chunk), spent.seconds
 
-    begun = (1 if scene.is_ordered else scene.realizations) - wanted
+    begun = scene.distinct_realizations - wanted
     hidden = None if progress else True
     with tqdm(total=begun + wanted, initial=begun, unit="chain", disable=hidden, leave=False) as bar:
         for done, measured, seconds in map_in_order(work, _chunks(numbers, plan.size), plan.workers):
@@ -465,7 +465,7 @@ def ensemble_moments(
         ranks: processes that share the realizations; each gets the result.
         settings: see :func:`stream`.
     """
-    realizations = 1 if scene.is_ordered else scene.realizations
+    realizations = scene.distinct_realizations
     cut = realizations, n_blocks, scene.sample_size
     device, stages = checks.device("device", device), stages or Stages()
     checks.instance("options", options, dict, type(None))
@@ -817,8 +817,7 @@ def band_transfer(
     checks.truth("long_time", long_time)
     scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
     long_time = long_time and scene.damping == 0
-    samples = 1 if scene.is_ordered else scene.realizations // scene.sample_size
-    n_blocks = min(BLOCKS, samples)
+    n_blocks = min(BLOCKS, scene.distinct_realizations // scene.sample_size)
 
     def measure(chunk: Chunk) -> dict[str, Tensor]:
         measured = chunk.observe(["band_energy"])

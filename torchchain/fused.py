@@ -130,22 +130,21 @@ def band_energy(
         strain += rows.contacts[0, 0] * 4 * np.sin(math.pi / n * np.arange(n // 2 + 1)) ** 2
     window = min(len(steps), max(1, _BLOCK // (8 * n)))
     size = min(rows.count, max(1, _BLOCK // (8 * n * window)))
+    strain = np.repeat(strain, 2)  # of the real and of the imaginary part
     march = stencil.March(rows, mirrored=True, once=window == len(steps))
     bands, totals = np.empty((rows.count, len(steps), n_bands)), np.empty((rows.count, len(steps)))
 
     def work(part: tuple[int, int]) -> None:
         # Little Python a block: a thread that waits for another's is slow to wake.
         begin, end = part
-        fields = torch.empty((count, min(size, end - begin), window, n), dtype=torch.float64)
-        there = fields.numpy()
+        fields = torch.empty((count, 0, 0, n), dtype=torch.float64)
         for low in range(begin, end, size):
             high = min(low + size, end)
             for first in range(0, len(steps), window):
                 last = min(first + window, len(steps))
                 if fields.shape[1:3] != (high - low, last - first):
                     fields = torch.empty((count, high - low, last - first, n), dtype=torch.float64)
-                    there = fields.numpy()
-                march.fields(low, high, steps[first:last], kind, there, low)
+                march.fields(low, high, steps[first:last], kind, fields.numpy(), low)
                 spectra = torch.fft.rfft(fields).numpy().view(np.float64)
                 stencil.bin_spectra(spectra, kind, strain, normalize, low, first, bands, totals)
                 del spectra  # so that the next lie where these do, in cache

@@ -48,7 +48,7 @@ class Facts:
         inner = scene if self.reach is None else self.reach.scene(scene)
         self.n = inner.n_particles
         self.rows = max(1, len(scene.tones))
-        self.chains = 1 if scene.is_ordered else scene.realizations
+        self.chains = scene.distinct_realizations
         sampled = max(1, min(SAMPLE, self.chains, SAMPLE_SIZE // self.n))
         chain = inner.chain(range(sampled))
         state = inner.state(chain)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
 
 from torchchain.statistics import EnsembleMoments
 
@@ -88,7 +87,7 @@ class Ranks:
         with _connected():
             for name, _, _ in names:
                 dist.broadcast(plain[name], src=0)
-        return moments if self.rank == 0 else _again(moments, plain)
+        return moments if self.rank == 0 else moments.again(plain)
 
 
 ALONE = Ranks()
@@ -158,12 +157,6 @@ def _connected() -> Iterator[None]:
         raise RuntimeError("another process of this run has ended or cannot be reached") from error
 
 
-def _again(like: EnsembleMoments, plain: Mapping[str, Tensor]) -> EnsembleMoments:
-    """Moments of the same ensemble from their tensors."""
-    realizations, n_blocks = like.edges[-1] * like.sample_size, len(like.edges) - 1
-    return EnsembleMoments.from_tensors(realizations, n_blocks, plain, like.sample_size)
-
-
 def _send(moments: EnsembleMoments, to: int) -> None:
     plain = moments.tensors()
     names = [(name, tuple(values.shape), values.dtype) for name, values in plain.items()]
@@ -178,4 +171,4 @@ def _received(like: EnsembleMoments, source: int) -> EnsembleMoments:
     plain = {name: torch.empty(shape, dtype=dtype) for name, shape, dtype in held[0]}
     for values in plain.values():
         dist.recv(values, src=source)
-    return _again(like, plain)
+    return like.again(plain)

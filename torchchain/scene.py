@@ -110,7 +110,7 @@ class Scene:
         checks.first_bad("times", f"be at most {LATEST_TIME:g}, where rounding blurs phases", self.times, late)
         if self.tolerance is not None:
             put("tolerance", checks.number("tolerance", self.tolerance, above=0, below=1))
-        put("opposite_pairs", checks.truth("opposite_pairs", self.opposite_pairs))
+        checks.truth("opposite_pairs", self.opposite_pairs)
         if self.realizations % self.sample_size:
             raise checks.fail("realizations", "be even for opposite_pairs", self.realizations)
         checks.choice("contact", self.contact, (*CONTACTS, "auto"))
@@ -148,6 +148,11 @@ class Scene:
         return self.disorder.strength == 0 and (
             self.stiffness_disorder is None or self.stiffness_disorder.strength == 0
         )
+
+    @property
+    def distinct_realizations(self) -> int:
+        """Chains to compute: one of an ordered scene, however many realizations it asks for."""
+        return 1 if self.is_ordered else self.realizations
 
     @property
     def sample_size(self) -> int:

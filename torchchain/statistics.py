@@ -95,7 +95,7 @@ class MomentTree:
             if start % 2:
                 left = self.waiting.pop((level, start - 1), None)
                 if left is None:
-                    self.waiting[level, start] = (mean.pop(0), squares.pop(0))
+                    self._wait(level, start, mean.pop(0), squares.pop(0))
                     start += 1
                 else:
                     mean, squares, start = [left[0], *mean], [left[1], *squares], start - 1
@@ -103,7 +103,7 @@ class MomentTree:
                 last = start + len(mean) - 1
                 right = self.waiting.pop((level, last + 1), None)
                 if right is None:
-                    self.waiting[level, last] = (mean.pop(), squares.pop())
+                    self._wait(level, last, mean.pop(), squares.pop())
                 else:
                     mean, squares = [*mean, right[0]], [*squares, right[1]]
             pairs = range(0, len(mean), 2)
@@ -111,11 +111,6 @@ class MomentTree:
             mean, squares = [m for m, _ in merged], [s for _, s in merged]
             level, start = level + 1, start // 2
         self._close()
-        # A leaf that still waits must not hold, or be changed with, the tensor that it came in.
-        for place in {(0, first), (0, first + len(values) - 1)} & self.waiting.keys():
-            self.waiting[place] = self.waiting[place][0].clone(), None
-        if self.whole is not None and self.whole.count == 1:
-            self.whole = Moments(1, self.whole.mean.clone(), self.whole.squares)
 
     def absorb(self, other: MomentTree) -> None:
         """Take in the realizations of another tree, which is used up."""
@@ -149,6 +144,10 @@ class MomentTree:
         if self.whole is not None:
             return [range(self.whole.count)]
         return joined(range(i << level, (i + 1) << level) for level, i in self.waiting)
+
+    def _wait(self, level: int, start: int, mean: Tensor, squares: Tensor | None) -> None:
+        """Keep a node until its sibling comes: of a leaf a copy, not a view of the tensor that it came in."""
+        self.waiting[level, start] = (mean.clone() if squares is None else mean, squares)
 
     def _close(self) -> None:
         """One node in place of those that wait, once every realization is in."""
@@ -251,6 +250,11 @@ class EnsembleMoments:
                 tree.count += 2**level
         moments.held()
         return moments
+
+    def again(self, plain: Mapping[str, Tensor]) -> EnsembleMoments:
+        """Other moments of the same ensemble, see :meth:`from_tensors`."""
+        realizations, n_blocks = self.edges[-1] * self.sample_size, len(self.edges) - 1
+        return self.from_tensors(realizations, n_blocks, plain, self.sample_size)
 
 
 def joined(ranges: Iterable[range]) -> list[range]:

@@ -736,7 +736,7 @@ def bin_spectra(spectra, kind, strain, normalize, row, time, bands, totals):
         spectra: transforms of the fields that :func:`march` leaves, without a factor, (field, row, time,
             2 (N/2 + 1)): the real and the imaginary part of each wavenumber in turn.
         kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS.
-        strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, (wavenumber,).
+        strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, twice for each wavenumber, (2 (N/2 + 1),).
         normalize: divide by the total.
         row, time: where in the results the spectra belong.
         bands: (row, time, band), written.
@@ -748,7 +748,6 @@ def bin_spectra(spectra, kind, strain, normalize, row, time, bands, totals):
     # 1/2 for the energy and 1/N for the unitary transform; k and -k are two, except where they are one.
     scale = 1.0 / (size - 2)
     energy = np.empty(size)
-    strains = np.repeat(strain, 2)
     for r in range(spectra.shape[1]):
         for i in range(spectra.shape[2]):
             p, q = spectra[0, r, i], spectra[1, r, i]
@@ -756,7 +755,7 @@ def bin_spectra(spectra, kind, strain, normalize, row, time, bands, totals):
             out = bands[row + r, time + i]
             if kind == UNIFORM_FIELDS:
                 for k in range(size):
-                    energy[k] = p[k] * q[k] + strains[k] * s[k] * s[k]
+                    energy[k] = p[k] * q[k] + strain[k] * s[k] * s[k]
             elif kind == SITE_FIELDS:
                 for k in range(size):
                     energy[k] = p[k] * q[k] + s[k] * t[k]
