@@ -278,7 +278,7 @@ def test_few_numbers_are_kept(tmp_path):
     scene = replace(SCENE, realizations=1023, observables=("center",))
     with pytest.MonkeyPatch.context() as patch:
         stopped_after(1000, patch)
-        patch.setattr(ensemble, "GROUPS", 10_000)  # one chain a chunk
+        patch.setattr("torchchain.ensemble.layout.GROUPS", 10_000)  # one chain a chunk
         with pytest.raises(KeyboardInterrupt, match="1000 of 1023"):
             tc.simulate(scene, "modes", checkpoint=Checkpoint(tmp_path, 1e-9))
     (part,) = tmp_path.iterdir()
