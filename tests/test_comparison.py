@@ -5,13 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
+
 import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.ensemble.comparison import compare, z_scores
 
 
 def scene(seed=0, **fields):
-    given = dict(n_particles=64, n_bands=8, realizations=60, times=torch.arange(0.0, 21.0, 1.0), seed=seed)
+    given = {"n_particles": 64, "n_bands": 8, "realizations": 60, "times": torch.arange(0.0, 21.0, 1.0), "seed": seed}
     return tc.Scene(**{**given, **fields})
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.ensemble.mixed_starts import fit_transfer
