@@ -15,13 +15,12 @@ import hashlib
 import json
 import os
 import re
-import shutil
 import signal
 import threading
 import time
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.ensemble.statistics import EnsembleMoments, joined
+from torchchain.locks import lock
 
 FORMAT = "torchchain-checkpoint-1"
 EVERY = 5.0
@@ -118,8 +118,16 @@ class Checkpoint:
         return Writer(self, self.folder / f"{session:05d}-{rank:05d}.safetensors", header)
 
     def clear(self) -> None:
-        """Remove the folder, once the results are elsewhere."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove the parts, once the results are elsewhere, and the folder if nothing else is in it."""
+        with suppress(OSError):
+            for path in self.folder.iterdir():
+                if _NAME.fullmatch(path.name.removesuffix(".tmp")):
+                    path.unlink(missing_ok=True)
+            self.folder.rmdir()
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Hold the folder while a run reads and writes it; another run's is a FieldError that names it."""
+        return lock(self.folder, "checkpoint")
 
     def _parts(self) -> list[_Part]:
         """The whole parts in the folder, without those that another one replaces."""
