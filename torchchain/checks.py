@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchchain.spelling import suggestion
+
 
 class FieldError(ValueError):
     """A value that breaks a rule: the message reads ``field must rule, got value``."""
@@ -79,7 +81,7 @@ def choice(field: str, value: Any, choices: Iterable[str]) -> str:
     if not isinstance(value, str):
         raise FieldTypeError(f"{field} must be a string, one of {', '.join(choices)}, got {shown(value)}")
     if value not in choices:
-        raise fail(field, f"be one of {', '.join(choices)}", repr(value))
+        raise fail(field, f"be one of {', '.join(choices)}", repr(value) + suggestion(value, choices))
     return value
 
 
@@ -113,7 +115,8 @@ def known_keys(field: str, given: Iterable[str], allowed: Iterable[str]) -> None
     allowed = tuple(allowed)
     for key in given:
         if key not in allowed:
-            raise fail(field, f"have only the keys {', '.join(allowed) or '(none)'}", repr(key))
+            told = suggestion(key, allowed) if isinstance(key, str) else ""
+            raise fail(field, f"have only the keys {', '.join(allowed) or '(none)'}", repr(key) + told)
 
 
 def real_tensor(field: str, value: Any) -> Tensor:
