@@ -491,9 +491,10 @@ def _tabulate(tables, frequency, tolerance, anchor, times, leaps, slack):
     Returns:
         Whether the tables are filled anew.
     """
-    known = leaps == 1
+    known = True
     for j in range(times.size):
-        known = known and abs(times[j] - anchor - tables.offsets[j]) <= slack * times[j]
+        near = slack * times[j] if leaps == 1 else 0.0
+        known = known and abs((times[j] - anchor) / leaps - tables.offsets[j]) <= near
     if known:
         return False
     for j in range(times.size):
@@ -645,9 +646,10 @@ def march(
         reference = 0.5 * (low + 1 + high)
         history = 0  # states on the grid before the anchor, in rows 1, 2, ...
         age = 0  # mirrored segments since the last plain one
+        leaps = 0  # equal ones that are still to be made to the next time
         i = 0
         while i < steps:
-            if since > 0 and (since >= LONGEST or frequency * (times[i] - anchor) > REACH):
+            if since > 0 and (leaps > 0 or since >= LONGEST or frequency * (times[i] - anchor) > REACH):
                 # The latest state becomes the anchor, and those before it follow in order.
                 _reverse(u, here)
                 _reverse(v, here)
@@ -656,14 +658,20 @@ def march(
                 low, high = _trim(w, row, u, v, history + 1, stiff, limit, start, stop)
                 anchor, since, here = when[0], 0, 0
             count = 1
-            if since > 0 or times[i] > anchor:
-                while (
-                    i + count < steps and since + count < LONGEST and frequency * (times[i + count] - anchor) <= REACH
-                ):
-                    count += 1
-                leaps = math.ceil(frequency * (times[i] - anchor) / LEAP)
-                _tabulate(tables, frequency, tolerance, anchor, times[i : i + count], leaps, slack)
-                mirror = leaps == 1 and count <= history and age < RESTART
+            if leaps > 0 or since > 0 or times[i] > anchor:
+                leaping = leaps > 0
+                if not leaping:
+                    while (
+                        i + count < steps
+                        and since + count < LONGEST
+                        and frequency * (times[i + count] - anchor) <= REACH
+                    ):
+                        count += 1
+                    # Counted down, not up to a time: the rounding of many sums would add up.
+                    leaps = math.ceil(frequency * (times[i] - anchor) / LEAP)
+                    leaping = leaps > 1
+                    _tabulate(tables, frequency, tolerance, anchor, times[i : i + count], leaps, slack)
+                mirror = not leaping and count <= history and age < RESTART
                 for j in range(count):
                     passed = anchor - when[j + 1]
                     mirror = mirror and abs(passed - tables.offsets[j]) <= slack * times[i + j]
@@ -672,11 +680,12 @@ def march(
                     _close(w, row, v[0])
                 start, stop = _advance(w, row, u, v, low, high, count, tables, mirror)
                 age = age + 1 if mirror else 0
+                leaps -= 1
                 for j in range(count):
-                    when[j + 1] = anchor + tables.offsets[j] if mirrored or leaps > 1 else times[i + j]
+                    when[j + 1] = anchor + tables.offsets[j] if leaps > 0 or (mirrored and not leaping) else times[i + j]
                 since += count
                 here = count
-                if leaps > 1:
+                if leaps > 0:
                     continue
             for j in range(count):
                 at = j + 1 if since > 0 else 0
