@@ -67,6 +67,16 @@ def test_agrees_with_modes(boundary, stiffness, kind, compiled):
     assert error(chebyshev_states(chain, state, times, compiled=compiled), expected) < 1e-9
 
 
+@pytest.mark.parametrize("times", [[2e7], [1e7, 1.5e7, 2e7]])
+def test_one_long_interval_keeps_the_phase(times):
+    """The rounding of the phases, W t eps = 1e-8, whatever the number of leaps to the time: some 2e5 here."""
+    chain = tc.Chain(torch.tensor([1, 0.8, 1.3, 0.9], dtype=torch.float64), "fixed")
+    state = tc.impulse(chain, 1)
+    expected = tc.evolve(chain, state, times, "modes")
+    limit = 20 * chain.squared_frequency_bound().sqrt().item() * times[-1] * torch.finfo(torch.float64).eps
+    assert error(chebyshev_states(chain, state, times), expected) < limit
+
+
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 def test_a_thousand_times_on_a_grid(boundary):
     chain = a_chain(boundary)

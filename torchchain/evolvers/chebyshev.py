@@ -233,12 +233,9 @@ class CompiledAdvance:
         def plain(x: Tensor) -> np.ndarray:
             return x.detach().double().reshape(-1, x.shape[-1]).contiguous().numpy()
 
-        contacts = chain.contact_stiffness
-        if chain.boundary == "periodic":
-            contacts = torch.cat([contacts, contacts[..., :1]], dim=-1)
-        masses, springs = plain(chain.masses), plain(contacts)
+        masses, springs = plain(chain.masses), plain(chain.in_a_row(chain.contact_stiffness))
         states = torch.stack([state.displacement.detach(), state.velocity.detach()], dim=-2)
-        periodic = chain.boundary == "periodic"
+        periodic = chain.is_free
         squared = np.empty(len(masses))
         if bound is None:
             stencil.share(
@@ -250,6 +247,7 @@ class CompiledAdvance:
         self.rows: Rows = stencil.Rows(
             masses=masses,
             contacts=springs,
+            rigid_masses=plain(chain.rigid_mass[..., None])[:, 0],
             frequencies=_rounded_up(np.sqrt(squared)),
             states=states.double().reshape(-1, 2, n).numpy(),
             starts=math.prod(state.displacement.shape[:-1]) // len(masses),

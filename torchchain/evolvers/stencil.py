@@ -155,15 +155,19 @@ def _first_four(w, u, v, row0, row1, row2, row3, for_u, for_v, j, keep_u, keep_v
 
 
 @_summing_kernel
-def _moments_site(w, u, v, mass, contact, reference, first, n):
-    """Sums of E, q E and q^2 E over n particles, E of Eq. 36 and q the particle number minus the reference."""
+def _moments_site(w, u, v, mass, contact, reference, first, moved, n):
+    """Sums of E, q E and q^2 E over n particles, E of Eq. 36 and q the particle number minus the reference.
+
+    Displacements are counted from how far the chain has moved as a whole.
+    """
     _wide_vectors()
     p, s, b, k, one = _U(u), _U(v), _U(mass), _U(contact), _U(1)
     total, center, width = 0.0, 0.0, 0.0
     q = first - reference
     for i in range(_U(n)):
         x, y = w[p + i], w[s + i]
-        energy = w[b + i] * y * y + x * (w[k + i] * (x - w[p + i - one]) + w[k + i + one] * (x - w[p + i + one]))
+        pull = w[k + i] * (x - w[p + i - one]) + w[k + i + one] * (x - w[p + i + one])
+        energy = w[b + i] * y * y + (x - moved) * pull
         number = q + np.float64(np.int64(i))
         total += energy
         center += number * energy
@@ -397,6 +401,15 @@ def _start_energy(w, row, u, v):
     return energy
 
 
+@_summing_kernel
+def _mean(w, row, at, rigid_mass):
+    """The mean of a row of the scratch by mass: how far, or how fast, the chain moves as a whole; 0 between walls."""
+    total = 0.0
+    for p in range(row.n):
+        total += w[row.mass + p] * w[at + p]
+    return total / rigid_mass
+
+
 @_kernel
 def _wall_moments(w, row, u, reference):
     """What :func:`_moments_bond` leaves out: a wall contact belongs as a whole to its one particle."""
@@ -408,24 +421,23 @@ def _wall_moments(w, row, u, reference):
 
 
 @_kernel
-def _record_moments(w, row, u, v, kind, low, high, reference, out):
+def _record_moments(w, row, u, v, kind, low, high, reference, moved, out):
     """Leaves total, center and width of one state's energy behind.
 
     Returns:
         The reference for the next state's moments, the particle at this center: the width must not come out as
         a small difference of large numbers.
     """
+    # The particles at rest beyond the window have half of its outermost contacts, and feel their pull.
+    if row.periodic and (low == 0 or high == row.n):
+        low, high = 0, row.n
+    low, high = max(low - 1, 0), min(high + 1, row.n)
+    size = high - low
     if kind == SITE_MOMENTS:
-        size = high - low
         total, first, second = _moments_site(
-            w, u + low, v + low, row.mass + low, row.contact + low, reference, low + 1.0, size
+            w, u + low, v + low, row.mass + low, row.contact + low, reference, low + 1.0, moved, size
         )
     else:
-        # Half of the outermost contacts' energy belongs to the particles at rest beyond the window.
-        if row.periodic and (low == 0 or high == row.n):
-            low, high = 0, row.n
-        low, high = max(low - 1, 0), min(high + 1, row.n)
-        size = high - low
         total, first, second = _moments_bond(
             w, u + low, v + low, row.mass + low, row.contact + low, reference, low + 1.0, size
         )
@@ -442,7 +454,7 @@ def _record_moments(w, row, u, v, kind, low, high, reference, out):
 
 
 @_kernel
-def _record_fields(w, row, u, v, kind, out, r, i):
+def _record_fields(w, row, u, v, kind, moved, out, r, i):
     """Leaves one state, or the fields that make up its energy in wavenumber space, in out[:, r, i]."""
     _wide_vectors()
     # One field a loop: with more pointers in one, the compiler gives up proving that they are apart.
@@ -459,11 +471,14 @@ def _record_fields(w, row, u, v, kind, out, r, i):
     displacement = first if kind == STATES else out[2, r, i]
     for q in range(n):
         velocity[q] = w[s + q]
-    for q in range(n):
-        displacement[q] = w[p + q]
-    if kind != STATES:
+    if kind == STATES:
         for q in range(n):
-            second[q] = w[b + q] * w[s + q]
+            displacement[q] = w[p + q]
+        return
+    for q in range(n):
+        displacement[q] = w[p + q] - moved
+    for q in range(n):
+        second[q] = w[b + q] * w[s + q]
     if kind == SITE_FIELDS:
         pull = out[3, r, i]
         for q in range(n):
@@ -563,7 +578,7 @@ def _advance(w, row, u, v, low, high, count, tables, mirror):
 
 @_kernel
 def march(
-    begin, end, masses, contacts, frequencies, starts, periodic, times, tolerance, mirrored, kind,
+    begin, end, masses, contacts, rigid_masses, frequencies, starts, periodic, times, tolerance, mirrored, kind,
     anchors, latest, clock, fields, moments, first,
 ):  # fmt: skip
     """Evolves rows begin to end - 1 through the times, each in cache from the first time to the last.
@@ -572,6 +587,7 @@ def march(
         begin, end: rows; row r is start r % starts of realization r // starts.
         masses: (realization, particle).
         contacts: stiffness of contacts 0 to N, (realization, N + 1); on a ring the last is the first.
+        rigid_masses: mass that moves as a whole, infinite between walls, (realization,).
         frequencies: W, no less than any frequency of the chain, (realization,).
         starts: rows per realization.
         periodic: whether the chains are rings.
@@ -641,6 +657,9 @@ def march(
         if clock[r, 3] < 0:
             clock[r, 3] = _start_energy(w, row, u[0], v[0])
         limit = TRIM * TRIM * clock[r, 3]
+        # The motion as a whole is uniform.
+        begun, moved = anchor, _mean(w, row, u[0], rigid_masses[realization])
+        pace = _mean(w, row, v[0], rigid_masses[realization])
         low, high = _trim(w, row, u[:1], v[:1], 1, stiff, limit, 0, n)
         start, stop = 0, n
         reference = 0.5 * (low + 1 + high)
@@ -682,7 +701,9 @@ def march(
                 age = age + 1 if mirror else 0
                 leaps -= 1
                 for j in range(count):
-                    when[j + 1] = anchor + tables.offsets[j] if leaps > 0 or (mirrored and not leaping) else times[i + j]
+                    when[j + 1] = (
+                        anchor + tables.offsets[j] if leaps > 0 or (mirrored and not leaping) else times[i + j]
+                    )
                 since += count
                 here = count
                 if leaps > 0:
@@ -691,13 +712,14 @@ def march(
                 at = j + 1 if since > 0 else 0
                 if periodic:
                     _close(w, row, u[at])
+                away = moved + pace * (times[i + j] - begun)
                 if kind in (SITE_MOMENTS, BOND_MOMENTS):
                     inner, outer = (start, stop) if since > 0 else (low, high)
                     reference = _record_moments(
-                        w, row, u[at], v[at], kind, inner, outer, reference, moments[r - first, i + j]
+                        w, row, u[at], v[at], kind, inner, outer, reference, away, moments[r - first, i + j]
                     )
                 else:
-                    _record_fields(w, row, u[at], v[at], kind, fields, r - first, i + j)
+                    _record_fields(w, row, u[at], v[at], kind, away, fields, r - first, i + j)
             i += count
         if latest.size == 0:
             continue
@@ -794,6 +816,7 @@ class Rows:
     Attributes:
         masses: (realization, particle), float64.
         contacts: (realization, N + 1), float64; on a ring the last contact is the first again.
+        rigid_masses: mass that moves as a whole, infinite between walls, (realization,), float64.
         frequencies: W, (realization,), float64.
         states: displacement and velocity, (row, 2, particle), float64; row r starts realization r // starts.
         starts: rows per realization.
@@ -803,6 +826,7 @@ class Rows:
 
     masses: np.ndarray
     contacts: np.ndarray
+    rigid_masses: np.ndarray
     frequencies: np.ndarray
     states: np.ndarray
     starts: int
@@ -844,7 +868,7 @@ class March:
     ) -> None:
         rows = self.rows
         march(
-            begin, end, rows.masses, rows.contacts, rows.frequencies, rows.starts, rows.periodic, times,
+            begin, end, rows.masses, rows.contacts, rows.rigid_masses, rows.frequencies, rows.starts, rows.periodic, times,
             rows.tolerance, self.mirrored, kind, self.anchors, self.latest, self.clock, fields, moments, first,
         )  # fmt: skip
 
