@@ -293,7 +293,9 @@ class BandTransfer(Printed):
         energies, blocks = energies.detach().cpu().double(), min(BLOCKS, len(energies))
         numbers = hashlib.sha256(energies.contiguous().numpy().tobytes() + times.double().numpy().tobytes())
         provenance = replace(provenance, hashes={**provenance.hashes, "energies": numbers.hexdigest()})
-        average, unsettled = _late_average(times, energies) if long_time is None else _given_average(energies, long_time)
+        average, unsettled = (
+            _late_average(times, energies) if long_time is None else _given_average(energies, long_time)
+        )
         moments = EnsembleMoments(len(energies), blocks)
         moments.add(0, {"band_energy": energies, "long_time_band_energy": average})
         transfer = _from_moments(None, times.cpu().double(), moments, {}, provenance)
@@ -314,7 +316,9 @@ def _late_average(times: Tensor, energies: Tensor) -> tuple[Tensor, Tensor]:
     """The mean over the later half of the times of every realization, and half of how far its two quarters differ."""
     late = energies[:, :, 2 * times >= times[-1]]
     first, second = late.tensor_split(2, dim=2)
-    unsettled = (second.mean((0, 2)) - first.mean((0, 2))).abs() / 2 if first.shape[2] else torch.zeros(late.shape[1::2])
+    unsettled = (
+        (second.mean((0, 2)) - first.mean((0, 2))).abs() / 2 if first.shape[2] else torch.zeros(late.shape[1::2])
+    )
     return late.mean(2), unsettled.double()
 
 
