@@ -34,7 +34,9 @@ def other(tmp_path):
 
 
 def test_a_folder_in_use_is_refused_in_one_line_that_names_it_and_its_holder(other, tmp_path):
-    with pytest.raises(FieldError, match=rf"out must be free, got .*/run, where process {other.pid} on .* is running") as e:
+    with pytest.raises(
+        FieldError, match=rf"out must be free, got .*/run, where process {other.pid} on .* is running"
+    ) as e:
         with lock(tmp_path / "run", "out"):
             pass
     assert "\n" not in str(e.value)

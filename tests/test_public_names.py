@@ -83,7 +83,15 @@ def test_a_type_checker_knows_what_a_name_is(tmp_path):
     mypy = pytest.importorskip("mypy.api", reason="mypy comes with the extra dev")
     script, config = tmp_path / "script.py", tmp_path / "mypy.ini"
     script.write_text(SCRIPT)
-    libraries = ["torch", "numpy", "scipy", "xarray", "matplotlib", "numba", "torchdiffeq"]  # large, and not in question
+    libraries = [
+        "torch",
+        "numpy",
+        "scipy",
+        "xarray",
+        "matplotlib",
+        "numba",
+        "torchdiffeq",
+    ]  # large, and not in question
     skipped = "".join(f"[mypy-{name}.*]\nfollow_imports = skip\n" for name in libraries)
     config.write_text(f"[mypy]\nignore_missing_imports = True\nfollow_imports = silent\n{skipped}")
     report, _, _ = mypy.run([str(script), f"--config-file={config}", f"--cache-dir={tmp_path}"])
