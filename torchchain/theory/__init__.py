@@ -1,0 +1,1 @@
+"""Band energies from the theory of disorder, without chains."""
