@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from scipy import special
 from torch import Tensor
@@ -32,7 +31,10 @@ FIRST, RATIO = 4.0, 10.0  # end of the first stretch of times, and how many time
 DECAY = 9.0  # eta times the period of the time grid: exp(-2 DECAY) = 1.5e-8 of a period's energy comes back
 _FIRST_CUT = 60.0  # frequencies kept for the first stretch: what starts as t^4 falls off as frequency^-5
 _SMOOTH = 9.0  # width of the frequency cut times the first time of a stretch: exp(-(_SMOOTH/2)^2) = 2e-9
-_TAIL = 3e-7  # share of the modes beyond the last frequency
+_LATE = 400.0  # stretches that start here or later are averaged over time, with the standard deviation
+_AVERAGE = 10.0
+_BLOCK = 2**22  # complex numbers of the spectrum kept at a time
+_TAIL, _LATE_TAIL = 3e-7, 1e-3  # share of the modes beyond the last frequency, and of a late stretch
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,17 +84,19 @@ class Stretch:
     points: int
 
 
-def stretches(last: float, edge: float, decay: float = DECAY) -> list[Stretch]:
-    """Stretches that cover times up to ``last`` for a spectrum that ends at ``edge``."""
+def stretches(
+    last: float, edges: tuple[float, float], decay: float = DECAY, momentum: bool = False
+) -> list[Stretch]:
+    """Stretches that cover times up to ``last`` for a spectrum with these :func:`spectrum_edges`."""
     found: list[Stretch] = []
     start, stop = 0.0, min(FIRST, last) or FIRST
     while True:
         if start == 0:
-            cut = max(_FIRST_CUT, 10 * edge) * max(1.0, 1.0 / stop)
+            cut = max(_FIRST_CUT, 10 * edges[0]) * max(1.0, 1.0 / stop) * (1 + momentum)
             smooth = cut / 5
         else:
             smooth = _SMOOTH / start
-            cut = edge + 3.5 * smooth
+            cut = edges[start >= _LATE] + 3.5 * smooth
         period = stop + 1.5 * _SMOOTH / smooth
         step = math.pi / period
         found.append(Stretch(start, stop, decay / period, step, cut, smooth, math.ceil((cut + 4 * smooth) / step)))
@@ -101,8 +105,8 @@ def stretches(last: float, edge: float, decay: float = DECAY) -> list[Stretch]:
         start, stop = stop, min(stop * RATIO, last)
 
 
-def spectrum_edge(law: Law) -> float:
-    """Frequency above which less than a share 3e-7 of the modes lies."""
+def spectrum_edges(law: Law) -> tuple[float, float]:
+    """Frequencies above which less than shares 3e-7 and 1e-3 of the modes lie."""
     top = 1.1 * 2 / math.sqrt(float(law.values.min()))
     w = torch.linspace(top / 1200, top, 1200, dtype=torch.float64)
     z = torch.complex(w, torch.full_like(w, 1e-4))
@@ -111,13 +115,14 @@ def spectrum_edge(law: Law) -> float:
     # 1e-4 above the axis every level has a tail of 1e-4 / (pi distance^2), which is no mode there.
     density = (density - 2e-4 / (math.pi * (w - 1).square().clamp(min=0.25))).clamp(min=0)
     beyond = (density * (w[1] - w[0])).flip(0).cumsum(0).flip(0)
-    return float(w[int((beyond > _TAIL).nonzero()[-1])]) if bool((beyond > _TAIL).any()) else top
+    first, late = (float(w[int((beyond > tail).nonzero()[-1])]) for tail in (_TAIL, _LATE_TAIL))
+    return first, late
 
 
-def ladder_transfer(law: Law, waves: Waves, times: Tensor, edge: float, decay: float = DECAY) -> Tensor:
+def ladder_transfer(law: Law, waves: Waves, times: Tensor, edges: tuple[float, float], decay: float = DECAY) -> Tensor:
     """Share of each source's energy in each band, [source, time, receiver]."""
     result = torch.zeros(len(waves.sources), len(times), waves.n_bands, dtype=torch.float64)
-    for stretch in stretches(float(times[-1]), edge, decay):
+    for stretch in stretches(float(times[-1]), edges, decay, waves.momentum):
         inside = (times <= stretch.stop) & ((times > stretch.start) | (stretch.start == 0))
         if bool(inside.any()):
             result[:, inside] = _one_stretch(law, waves, times[inside], stretch)
@@ -143,13 +148,23 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
     coherent = _coherent(law, waves, times, stretch, z, source / loss, loss, window)
 
     # A pair has the mean frequency (n + 1/2) step and the difference 2 m step + 2 i eta; n < 0 mirrors n >= 0.
-    spectrum = torch.empty(points, len(waves.sources), waves.n_bands, dtype=torch.complex128)
+    differences = 2 * stretch.step * torch.arange(points, dtype=torch.float64)
+    low_pass = torch.ones(points, dtype=torch.complex128)
+    if stretch.start >= _LATE:  # a Gaussian average of the energy itself: the whole complex difference
+        low_pass = torch.exp(-(torch.complex(differences, torch.full_like(right, 2 * stretch.eta)) * _AVERAGE).square() / 2)
+    used = max(1, int((low_pass.abs() > 1e-9).sum()))
+    low_pass[1:] *= 2
+    growth = torch.exp(2 * stretch.eta * times)
+    pairs = len(waves.sources) * waves.n_bands
+    block = min(used, max(1, _BLOCK // pairs))
+    spectrum = torch.empty(block, len(waves.sources), waves.n_bands, dtype=torch.complex128)
+    energy_in_time = torch.zeros(len(times), pairs, dtype=torch.float64)
     window = window * math.sqrt(2.0)
     squares = inner.square()
     z_, squares_, mass_, argument_, g_, loss_, window_, source_, received_ = (
         x.conj().resolve_conj() for x in (z, squares, mass, argument, g, loss, window, source, received)
     )
-    for m in range(points):
+    for m in range(used):
         above, below = slice(points + m, 2 * points), slice(points - m, 2 * (points - m))
         z1, a, e1, g1, l1 = z[above], squares[above], argument[above], g[above], loss[above]
         z2, b, e2, g2, l2 = z_[below], squares_[below], argument_[below], g_[below], loss_[below]
@@ -161,12 +176,13 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
             energy = (l1 / z1.square() + l2 / z2.square()) / 2 + 1 / (z1 * z2)
         weight = window[above] * window_[below] * vertex * energy / (d_argument * l1 * l2)
         left = source[:, above] * source_[:, below] * weight
-        spectrum[m] = left @ (received[:, above] - received_[:, below]).T
-    difference = 2 * stretch.step * torch.arange(points, dtype=torch.float64)
-    phase = torch.exp(torch.complex(2 * stretch.eta * times, -0.0 * times)) * torch.exp(-1j * difference[:, None] * times)
-    phase[1:] *= 2
-    flat = spectrum.reshape(points, -1)
-    energy_in_time = phase.real.T @ flat.real - phase.imag.T @ flat.imag
+        spectrum[m % block] = left @ (received[:, above] - received_[:, below]).T
+        if m % block == block - 1 or m == used - 1:
+            some = slice(m - m % block, m + 1)
+            angle = differences[some, None] * times
+            flat = spectrum[: m % block + 1].reshape(-1, pairs) * low_pass[some, None]
+            energy_in_time += angle.cos().T @ flat.real + angle.sin().T @ flat.imag
+    energy_in_time *= growth[:, None]
     area = 2 * stretch.step**2 / (2 * math.pi) ** 2
     scale = _source_scale(law, waves) * area
     spread = energy_in_time.reshape(len(times), len(waves.sources), waves.n_bands).transpose(0, 1) * scale[:, None, None]
@@ -215,40 +231,46 @@ def _coherent(
     mass = 1 / law.moment(-1)
     rest = (mean - 1 / (squared * loss - z.square() * mass)) * window
     wave = torch.exp(-1j * z[:, None] * times) * (stretch.step / (2 * math.pi))
+    if stretch.start >= _LATE:  # positive frequencies alone: no products that swing twice as fast
+        wave[: len(z) // 2] = 0
+    else:
+        wave /= 2
+    # Complex amplitudes whose real part is the amplitude, the oscillator's first.
     displacement, velocity, momentum = _oscillator(squared, mass, waves.damping, times, waves.momentum)
-
-    def in_time(transform: Tensor) -> Tensor:
-        return (transform @ wave).real
-
     if waves.momentum:
-        displacement = displacement + in_time(rest)
-        velocity = velocity + in_time(-1j * z * rest)
-        momentum = momentum + in_time(-1j / z * squared * rest)
-        return (velocity * momentum + squared * displacement.square()) * mass
-    displacement = displacement + in_time(-1j / z * squared * rest)
-    velocity = velocity + in_time(-squared * rest)
-    momentum = momentum + in_time(-loss / z.square() * squared.square() * rest)
-    return displacement.square() + velocity * momentum / squared
+        displacement = displacement + 2 * (rest @ wave)
+        velocity = velocity + 2 * (-1j * z * rest) @ wave
+        momentum = momentum + 2 * (-1j / z * squared * rest) @ wave
+    else:
+        displacement = displacement + 2 * (-1j / z * squared * rest) @ wave
+        velocity = velocity + 2 * (-squared * rest) @ wave
+        momentum = momentum + 2 * (-loss / z.square() * squared.square() * rest) @ wave
+    if stretch.start >= _LATE:
+        potential, kinetic = displacement.abs().square() / 2, (velocity * momentum.conj()).real / 2
+    else:
+        potential, kinetic = displacement.real.square(), velocity.real * momentum.real
+    return (kinetic + squared * potential) * mass if waves.momentum else potential + kinetic / squared
 
 
 def _oscillator(
     squared: Tensor, mass: float, damping: float, times: Tensor, momentum: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Displacement, velocity and momentum of m u'' + d w^2 u' + w^2 u = 0, from u = 1 at rest or from momentum 1 at u = 0."""
+    """Displacement, velocity and momentum of m u'' + d w^2 u' + w^2 u = 0, from u = 1 at rest or from momentum 1 at u = 0.
+
+    The real parts are they; an oscillator that swings has its positive frequency alone.
+    """
     half = damping * squared / (2 * mass)
     root = torch.sqrt(torch.complex(half.square() - squared / mass, torch.zeros_like(half)))
     fast, slow = -half + root, -half - root
     apart = fast - slow
     up, down = torch.exp(fast * times), torch.exp(slow * times)
+    swings = (root.imag > 0).expand(up.shape)
     if momentum:
-        displacement = ((up - down) / apart).real / mass
-        velocity = ((fast * up - slow * down) / apart).real / mass
+        displacement, velocity = (up - down) / apart / mass, (fast * up - slow * down) / apart / mass
+        one = [-2 * down / apart / mass, -2 * slow * down / apart / mass]
     else:
-        displacement = ((fast * down - slow * up) / apart).real
-        velocity = (fast * slow * (down - up) / apart).real
+        displacement, velocity = (fast * down - slow * up) / apart, fast * slow * (down - up) / apart
+        one = [2 * fast * down / apart, 2 * fast * slow * down / apart]
+    displacement = torch.where(swings, one[0], displacement)
+    velocity = torch.where(swings, one[1], velocity)
     return displacement, velocity, mass * velocity
-
-
-def as_numpy(values: Tensor) -> np.ndarray:
-    """The values for scipy."""
-    return values.detach().cpu().numpy()

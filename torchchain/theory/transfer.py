@@ -14,7 +14,7 @@ from torchchain import checks
 from torchchain.bands import center_tones, check_bands
 from torchchain.chain import BOUNDARIES, CONTACTS
 from torchchain.disorder import Disorder
-from torchchain.theory.ladder import DECAY, Waves, ladder_transfer, spectrum_edge, stretches
+from torchchain.theory.ladder import DECAY, Waves, ladder_transfer, spectrum_edges, stretches
 from torchchain.theory.law import Law, law_of
 from torchchain.theory.localized import MEASURED, Frequencies, Return, interference, onset, source_frequencies
 from torchchain.threads import single_thread
@@ -71,7 +71,7 @@ def theory_transfer(
             take the place of masses and tensions that of displacements.
         n_particles: N, even.
         n_bands: B.
-        times: (time,), up to 5000.
+        times: (time,), up to 5000; the ladder beyond 400 is averaged over some 10 units of time around each.
         tones: one or more sources, counted from 1; None for the center tone of every band.
         boundary: "periodic"; plane waves are no modes of the mean fixed chain.
         stiffness_disorder: of the contacts; with equal masses alone.
@@ -98,8 +98,8 @@ def theory_transfer(
     )
     checks.truth("localization", localization)
     with single_thread(), torch.no_grad():
-        edge = spectrum_edge(law)
-        mean = ladder_transfer(law, waves, times, edge, decay)
+        edges = spectrum_edges(law)
+        mean = ladder_transfer(law, waves, times, edges, decay)
         total = mean.sum(-1)
         closure = 0.0
         if damping == 0:
@@ -109,7 +109,7 @@ def theory_transfer(
         long_error = torch.zeros(len(k), dtype=torch.float64)
         error = torch.zeros(len(k), len(times), dtype=torch.float64)
         ring = _coarser(waves)
-        for s, (spectrum, wave) in enumerate(zip(source_frequencies(law, ring, edge), k.tolist(), strict=True)):
+        for s, (spectrum, wave) in enumerate(zip(source_frequencies(law, ring, edges[0]), k.tolist(), strict=True)):
             plain, pattern = _patterns(ring, wave, spectrum, numbers)
             came = onset(times, spectrum, numbers)
             earlier = onset(2 * times, spectrum, numbers)
@@ -124,7 +124,7 @@ def theory_transfer(
                 final = pattern.sum(-1)
                 long_time[s] = plain + final if localization else plain
                 long_error[s] = (_SHAPE_ERROR if localization else 1.0) * _distance(final)
-    settings = {"edge": edge, "closure": closure, "stretches": stretches(float(times[-1]), edge, decay)}
+    settings = {"edge": edges[0], "closure": closure, "stretches": stretches(float(times[-1]), edges, decay, waves.momentum)}
     return TheoryTransfer(times, mean, long_time, error, long_error, settings)
 
 
