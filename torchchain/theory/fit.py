@@ -124,7 +124,7 @@ def fit_disorder(
         weight = 1 / np.sqrt(variance + systematic**2 + 1e-10)
         solution = least_squares(
             lambda p, weight=weight: (model(p)[0] - mean) * weight,
-            parameters, bounds=bounds, diff_step=_STEP, xtol=1e-4, ftol=1e-6, x_scale=np.array([1.0, 0.1])[: len(first)],
+            parameters, bounds=bounds, diff_step=_STEP, xtol=3e-4, ftol=1e-5, max_nfev=12, x_scale=np.array([1.0, 0.1])[: len(first)],
         )  # fmt: skip
         parameters = solution.x
     gain = np.linalg.pinv(solution.jac) * weight  # estimate's change with the data, (parameter, datum)

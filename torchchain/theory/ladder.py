@@ -108,7 +108,7 @@ def stretches(
 def spectrum_edges(law: Law) -> tuple[float, float]:
     """Frequencies above which less than shares 3e-7 and 1e-3 of the modes lie."""
     top = 1.1 * 2 / math.sqrt(float(law.values.min()))
-    w = torch.linspace(top / 1200, top, 1200, dtype=torch.float64)
+    w = torch.linspace(top / 500, top, 500, dtype=torch.float64)
     z = torch.complex(w, torch.full_like(w, 1e-4))
     mass, _ = coherent_mass(z, law)
     density = (2 / math.pi / w) * (z.square() * mass * site_resolvent(z.square() * mass)).imag

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +77,7 @@ def _fine_rule(disorder: Disorder) -> tuple[np.ndarray, np.ndarray]:
         return np.ones(1), np.ones(1)
     if disorder.kind == "binary":
         return np.array([1 - xi, 1 + xi]), np.array([0.5, 0.5])
-    x, w = np.polynomial.legendre.leggauss(_POINTS)
+    x, w = _legendre()
     if disorder.kind == "uniform":
         start, stop = max(lower, 1 - np.sqrt(3) * xi), 1 + np.sqrt(3) * xi
         return _scaled(x, start, stop), w
@@ -95,6 +96,11 @@ def _fine_rule(disorder: Disorder) -> tuple[np.ndarray, np.ndarray]:
     logs = _scaled(x, np.log(start), np.log(special.gammainccinv(shape, _TAIL) * xi**2))
     height = shape * (logs - np.exp(logs))
     return np.exp(logs), w * np.exp(height - height.max())
+
+
+@functools.cache
+def _legendre() -> tuple[np.ndarray, np.ndarray]:
+    return np.polynomial.legendre.leggauss(_POINTS)
 
 
 def _scaled(x: np.ndarray, start: float, stop: float) -> np.ndarray:
@@ -120,4 +126,4 @@ def _gauss_rule(values: np.ndarray, weights: np.ndarray, nodes: int) -> tuple[np
         basis[i + 1] = vector / beside[i]
     matrix = np.diag(diagonal[:nodes]) + np.diag(beside[: nodes - 1], 1) + np.diag(beside[: nodes - 1], -1)
     found, vectors = np.linalg.eigh(matrix)
-    return found, vectors[0] ** 2 * 1.0
+    return found, vectors[0] ** 2

@@ -141,7 +141,7 @@ class _Line:
     def __init__(self, law: Law, edge: float) -> None:
         self.law = law
         band = min(2 / math.sqrt(law.mean), edge / 1.2)
-        w = np.unique(np.concatenate([np.linspace(edge * 1e-4, edge, 600), np.linspace(0.8 * band, 1.2 * band, 600)]))
+        w = np.unique(np.concatenate([np.linspace(edge * 1e-4, edge, 300), np.linspace(0.8 * band, 1.2 * band, 300)]))
         mass, _ = coherent_mass(self._above(torch.from_numpy(w)), law)
         self._mass = CubicSpline(w, mass.numpy())
 

@@ -20,8 +20,8 @@ from torchchain import checks
 from torchchain.disorder import Disorder
 from torchchain.theory.law import Law, law_of
 
-_DAMPED_STEPS = 60
-_NEWTON_STEPS = 60
+_STEPS, _DAMPED_STEPS = 150, 60
+_NEAR = 0.5
 _ABOVE_THE_AXIS = 1e-7  # a real frequency is taken as its limit from above
 
 
@@ -120,38 +120,38 @@ def coherent_mass(
     Damped iteration of mu = s - 1 / H(s), s = mu + 1 / (z^2 g), H(s) = < 1 / (s - m) >, which is the condition of no
     scattering and converges in the upper half-plane; then Newton's method.
     """
-    squared = z.square()
-    values, weights = law.values.to(z.real), law.weights.to(z.real)
-    mass = torch.full_like(z, law.mean) if start is None else start
+    values = law.values.to(z.real)
     if len(values) == 1:
         return torch.full_like(z, float(values[0])), 0.0
+    weights = law.weights.to(z)
+    mass = torch.full_like(z, law.mean) if start is None else start.clone()
 
-    def mismatch(mass: Tensor) -> tuple[Tensor, Tensor]:
+    def mismatch(squared: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         g, slope = _resolvent_and_slope(squared * mass, n_particles)
         apart = 1 / (squared * g)
         inverse = 1 / ((mass + apart)[:, None] - values)
-        mean = inverse @ weights.to(inverse)
-        mean_slope = -inverse.square() @ weights.to(inverse)
+        mean, mean_slope = inverse @ weights, -inverse.square() @ weights
         shift = 1 - apart / g * slope * squared
         return 1 / mean - apart, 1 - shift - shift * mean_slope / mean.square()
 
-    if start is None:
-        for _ in range(_DAMPED_STEPS):
-            off, _ = mismatch(mass)
-            mass = mass - 0.5 * off
-            if float(off.abs().max()) < 1e-4:
-                break
-    off, slope = mismatch(mass)
-    for _ in range(_NEWTON_STEPS):
-        if float(off.abs().max()) < tolerance:
+    # Newton's steps for what is near; the rest takes the damped iteration's, which converges from anywhere above the axis.
+    active = torch.arange(len(z))
+    residual = torch.zeros_like(z.real)
+    for step in range(_STEPS):
+        squared, here = z[active].square(), mass[active]
+        off, slope = mismatch(squared, here)
+        residual[active] = off.abs()
+        open_ = ~(off.abs() < tolerance)
+        if not bool(open_.any()):
             break
-        step = off / slope
-        trial = mass - step
-        # A step that leaves the upper half-plane, or a long one, is replaced by the damped iteration's.
-        good = ((squared * trial).imag > 0) & (step.abs() < 0.5 * mass.abs())
-        mass = torch.where(good, trial, mass - 0.5 * off)
-        off, slope = mismatch(mass)
-    return mass, float(off.abs().max())
+        active, squared, here, off, slope = active[open_], squared[open_], here[open_], off[open_], slope[open_]
+        newton = off / slope
+        trial = here - newton
+        good = ((squared * trial).imag > 0) & (newton.abs() < _NEAR * here.abs())
+        if start is None and step < _DAMPED_STEPS:
+            good &= off.abs() < 1e-3
+        mass[active] = torch.where(good, trial, here - 0.5 * off)
+    return mass, float(residual.max())
 
 
 def site_resolvent(argument: Tensor, n_particles: int | None = None) -> Tensor:
