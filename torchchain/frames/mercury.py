@@ -96,11 +96,14 @@ def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iter
                 columns = _columns(here, text, len(corners) // 2)
             rows = parse(here, text.blocks(count), columns or SOLID, set(), WANTED)
             rows["id"] = np.arange(count)
-            half = len(corners) // 2
-            low, high = corners[:half], corners[half:]
-            flat = (0.0,) * (3 - half)
-            # The file does not say which boundaries are periodic, and MercuryDPM wraps at those that are.
-            yield Raw(rows, Box((*low, *flat), (*high, *flat), (False, False, False)))  # type: ignore[arg-type]
+            yield Raw(rows, _box(corners))
+
+
+def _box(corners: list[float]) -> Box:
+    """The domain. The file does not say which boundaries are periodic, and MercuryDPM wraps at those that are."""
+    half = len(corners) // 2
+    low, high = ([*side, 0.0][:3] for side in (corners[:half], corners[half:]))
+    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]), (False, False, False))
 
 
 def _columns(here: str, text: Text, dimensions: int) -> tuple[str, ...]:

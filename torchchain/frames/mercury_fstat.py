@@ -23,7 +23,7 @@ _LARGE = 1 << 31  # no more particles than this, so that a pair is one number
 
 
 def _header(text: Text, number: int) -> float | None:
-    lines = []
+    lines: list[list[str]] = []
     for _ in range(3):
         line = text.line()
         if line is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -24,8 +25,11 @@ NOISE = 1e-3  # share of the displacement that the digits of the positions may l
 
 
 def warn(field: str, words: str) -> None:
-    """A warning of one line that begins with file, frame and field."""
-    warnings.warn(FramesWarning(" ".join(f"{field}: {words}".split())), stacklevel=4)
+    """A warning of one line that begins with file, frame and field, shown at the caller's line."""
+    level, caller = 2, sys._getframe(1)
+    while caller.f_back is not None and caller.f_globals.get("__name__", "").startswith("torchchain."):
+        level, caller = level + 1, caller.f_back
+    warnings.warn(FramesWarning(" ".join(f"{field}: {words}".split())), stacklevel=level)
 
 
 def here(name: str, frame: Frame) -> str:

@@ -462,7 +462,7 @@ class Frames:
         if isinstance(reference, Frame):
             return reference, "reference"
         if not isinstance(reference, Frames):
-            options = {name: value for name, value in self._options.items() if name != "time_step"}
+            options = {name: value for name, value in self._options.items() if name == "periodic"}  # only where it is
             reference = Frames(read_frames(reference, **options)._places, options, None, self._scale, self._keep)
         if len(reference) != 1:
             raise checks.fail(
@@ -487,7 +487,7 @@ class Frames:
         listed = [
             (place.contact_file, place.contact_entry) for place in places if place.contact_file and place.contact_entry
         ]
-        contacts = (raw for file, group in _groups(listed) for raw in file.format.read(file.path, group, self._options))  # type: ignore[arg-type]
+        contacts = (raw for file, group in _groups(listed) for raw in file.format.read(file.path, group, self._options))
         own: Iterator[Any] = iter(())
         if places[0].file.format is netcdf.FORMAT and places[0].contact_file is None:
             own = (
@@ -619,10 +619,19 @@ def _kept(frame: Frame, places: Tensor) -> Frame:
         contacts = Contacts(
             pairs, *(None if v is None else v[inside] for v in (contacts.overlap, contacts.normal_force))
         )
+
+    def part(values: Tensor | None) -> Tensor | None:
+        return None if values is None else values[places]
+
     return replace(
-        frame, ids=frame.ids[places], positions=frame.positions[places], contacts=contacts,
-        **{name: None if getattr(frame, name) is None else getattr(frame, name)[places] for name in ("velocities", "masses", "radii")},
-    )  # fmt: skip
+        frame,
+        ids=frame.ids[places],
+        positions=frame.positions[places],
+        velocities=part(frame.velocities),
+        masses=part(frame.masses),
+        radii=part(frame.radii),
+        contacts=contacts,
+    )
 
 
 def _check_same(at: str, frame: Frame, first: Frame) -> None:
@@ -692,7 +701,7 @@ def _masses(at: str, frame: Frame, types: np.ndarray | None, file: _File, option
     values = checks.real_tensor("masses", given).to(torch.float64)
     if values.ndim > 1 or (values.ndim == 1 and len(values) != n):
         raise checks.fail("masses", f"be a number or {n} numbers, one for each id", f"shape {tuple(values.shape)}")
-    checks.first_bad("masses", "be positive", values, values <= 0, None if values.ndim == 0 else "particle")  # type: ignore[arg-type]
+    checks.first_bad("masses", "be positive", values, values <= 0, "particle")
     return {"masses": values.expand(n).clone()}
 
 

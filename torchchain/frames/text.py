@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas
@@ -59,7 +59,7 @@ class Text:
         self.name = path.name
         with open(path, "rb") as file:
             self.compressed = file.read(2) == b"\x1f\x8b"
-        self._file: IO[bytes] = gzip.open(path, "rb") if self.compressed else open(path, "rb")  # noqa: SIM115
+        self._file: Any = gzip.open(path, "rb") if self.compressed else open(path, "rb")  # noqa: SIM115
         self._buffer, self._start, self._ended = b"", 0, False
         self.position = 0
         if position:
