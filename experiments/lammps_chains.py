@@ -191,14 +191,12 @@ def hertz_data(masses: Tensor, state: tc.State) -> str:
 
 def kinetic(log: str) -> Tensor:
     """The column KinEng of a log, (frame,)."""
-    rows = log[log.index("Step") :].splitlines()
-    names, values = rows[0].split(), []
-    for row in rows[1:]:
-        words = row.split()
-        if len(words) != len(names) or not words[0].isdigit():
-            break
-        values.append(float(words[names.index("KinEng")]))
-    return torch.tensor(values, dtype=torch.float64)
+    rows = [row.split() for row in log.splitlines()]
+    begin = next(i for i, words in enumerate(rows) if words[:2] == ["Step", "Time"])
+    end = next(i for i, words in enumerate(rows) if words[:2] == ["Loop", "time"])
+    column, width = rows[begin].index("KinEng"), len(rows[begin])
+    table = [words for words in rows[begin + 1 : end] if len(words) == width and words[0].isdigit()]  # warnings between
+    return torch.tensor([float(words[column]) for words in table], dtype=torch.float64)
 
 
 # Runs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from torchchain.frames.lammps import read_header, scan_dump, where
 from torchchain.frames.registry import Entry, Format, Raw, Scan
 from torchchain.frames.text import Text, parse
 
-FIELDS = ("id1", "id2", "overlap", "normal_force")
+FIELDS = ("id1", "id2", "overlap", "distance", "normal_force")
 PAIRS = (("id1", "id2"), ("patom1", "patom2"), ("natom1", "natom2"), ("batom1", "batom2"))
 
 
@@ -50,22 +51,39 @@ def whole(here: str, name: str, values: np.ndarray) -> np.ndarray:
     return values.astype(np.int64)
 
 
-def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iterator[Raw]:
+def _compute(name: str) -> str:
+    """The part of a column's name that says which compute it is from."""
+    return name.partition("[")[0]
+
+
+def can_be_ids(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether two columns can be the ids of pairs: whole numbers from 1 on, different in each row."""
+    whole_numbers = all((values == np.rint(values)).all() and (values >= 1).all() for values in (first, second))
+    return bool(whole_numbers and len(first) and (first != second).all())
+
+
+def read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iterator[Raw]:
+    """The contacts of each entry."""
     given = options.get("contact_columns")
     for here, names, rows in read_columns(path, entries):
-        chosen = _chosen(here, names, given)
+        chosen = _chosen(here, names, rows, given)
         found = {field: rows[name] for field, name in chosen.items()}
         yield Raw(
             {field: whole(here, chosen[field], v) if field in ("id1", "id2") else v for field, v in found.items()}
         )
 
 
-def _chosen(here: str, names: Sequence[str], given: Any) -> dict[str, str]:
-    """Which column is which field."""
+def _chosen(here: str, names: Sequence[str], rows: dict[str, np.ndarray], given: Any) -> dict[str, str]:
+    """Which column is which field: as given, by name, or the only two neighbors that can be ids."""
     if given is None:
         for first, second in PAIRS:
             if first in names and second in names:
                 return {"id1": first, "id2": second} | {field: field for field in FIELDS[2:] if field in names}
+        if not len(rows[names[0]]):
+            return {"id1": names[0], "id2": names[0]}
+        pairs = [(a, b) for a, b in pairwise(names) if _compute(a) == _compute(b) and can_be_ids(rows[a], rows[b])]
+        if len(pairs) == 1:
+            return {"id1": pairs[0][0], "id2": pairs[0][1]}
         raise checks.fail(
             f"{here}: columns",
             "be named by contact_columns={'id1': ..., 'id2': ...}, as the file does not say which are ids",
@@ -92,6 +110,6 @@ FORMAT = Format(
     endings=(),
     recognizes=lambda head: b"ITEM: ENTRIES" in head,
     scan=scan,
-    read=_read,
-    options={"contact_columns": "dict from id1, id2, overlap, normal_force to names of columns"},
+    read=read,
+    options={"contact_columns": "dict from id1, id2, overlap, distance, normal_force to names of columns"},
 )

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from torchchain import checks
-from torchchain.frames.lammps_local import read_columns, scan, whole
+from torchchain.frames import lammps_local
+from torchchain.frames.lammps_local import can_be_ids, read_columns, scan, whole
 from torchchain.frames.registry import Entry, Format, Raw
 
 # The order in which the compute writes, whatever the order of its keywords, and the values of each.
@@ -21,6 +22,9 @@ WIDTHS = {
 
 def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iterator[Raw]:
     given = options.get("contact_columns")
+    if isinstance(given, dict):  # columns by their names, as in any list
+        yield from lammps_local.read(path, entries, options)
+        return
     for here, names, rows in read_columns(path, entries):
         values = [rows[name] for name in names]
         if given is None:
@@ -69,8 +73,7 @@ def _ids(here: str, names: Sequence[str], values: list[np.ndarray]) -> int:
     good = []
     for i in range(len(values) - 2):
         a, b, flag = values[i : i + 3]
-        ids = all((v == np.rint(v)).all() and (v >= 1).all() for v in (a, b)) and (a != b).all()
-        if ids and np.isin(flag, (0, 1)).all():
+        if can_be_ids(a, b) and np.isin(flag, (0, 1)).all():
             good.append(i)
     if len(good) != 1:
         raise checks.fail(
@@ -81,19 +84,19 @@ def _ids(here: str, names: Sequence[str], values: list[np.ndarray]) -> int:
     return good[0]
 
 
+def _one_compute(head: bytes) -> bool:
+    line = head.partition(b"ITEM: ENTRIES")[2].partition(b"\n")[0].split()
+    return len(line) >= 3 and all(word.startswith(line[0].partition(b"[")[0] + b"[") for word in line)
+
+
 FORMAT = Format(
     name="liggghts_local",
     holds="contacts",
     summary="LIGGGHTS dump local of compute pair/gran/local with its keyword id",
     endings=(),
     # One compute's values and nothing else; a LAMMPS list names its ids by another compute or by a name.
-    recognizes=lambda head: _one_compute(head),
+    recognizes=_one_compute,
     scan=scan,
     read=_read,
     options={"contact_columns": "the keywords of compute pair/gran/local in one string"},
 )
-
-
-def _one_compute(head: bytes) -> bool:
-    line = head.partition(b"ITEM: ENTRIES")[2].partition(b"\n")[0].split()
-    return len(line) >= 3 and all(word.startswith(line[0].partition(b"[")[0] + b"[") for word in line)

@@ -738,11 +738,11 @@ def _contacts(at: str, columns: dict[str, np.ndarray], frame: Frame, name: str) 
     same = pairs[:, 0] == pairs[:, 1]
     if same.any():
         raise checks.fail(f"{at}: contacts", "join two particles", f"id {int(ids[pairs[same][0, 0]])} with itself")
-    rest = {
-        field: torch.from_numpy(np.ascontiguousarray(columns[field])) if field in columns else None
-        for field in ("overlap", "normal_force")
-    }
-    return Contacts(torch.from_numpy(pairs), rest["overlap"], rest["normal_force"])
+    rest = {name: torch.from_numpy(np.ascontiguousarray(v, dtype=np.float64)) for name, v in columns.items()}
+    overlap = rest.get("overlap")
+    if overlap is None and "distance" in rest and frame.radii is not None:
+        overlap = frame.radii[pairs].sum(-1) - rest["distance"]  # a list with distances has no walls
+    return Contacts(torch.from_numpy(pairs), overlap, rest.get("normal_force"))
 
 
 def _own_contacts(at: str, found: dict[str, np.ndarray], n: int) -> Contacts:

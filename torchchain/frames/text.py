@@ -235,6 +235,9 @@ def parse(
         for i in kinds:
             parts[columns[i]].append(table[i].to_numpy())
         done += rows
+    for i, kind in kinds.items():
+        if not parts[columns[i]]:
+            parts[columns[i]].append(np.empty(0, dtype=kind))
     return {name: part[0] if len(part) == 1 else np.concatenate(part) for name, part in parts.items()}
 
 
