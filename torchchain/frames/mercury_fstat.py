@@ -82,7 +82,7 @@ def _once(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Each contact once: a pair has a row for either side, a contact with a wall or a fixed particle only one."""
     first, second = rows["id1"], rows["id2"]
     paired = np.isin(second * _LARGE + first, first * _LARGE + second)
-    keep = (second < 0) | (first < second) | ~paired
+    keep = (second < 0) | (first <= second) | ~paired
     return {name: values[keep] for name, values in rows.items()} | {"id2": np.where(second < 0, -1, second)[keep]}
 
 

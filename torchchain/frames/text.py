@@ -233,7 +233,7 @@ def parse(
         if not good:
             raise _first_bad(where, block, columns, integers, wanted, done)
         for i in kinds:
-            parts[columns[i]].append(table[i].to_numpy())
+            parts[columns[i]].append(table[i].to_numpy(copy=True))
         done += rows
     for i, kind in kinds.items():
         if not parts[columns[i]]:
