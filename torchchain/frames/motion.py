@@ -117,6 +117,7 @@ def displacements(
     reference: Frame,
     reference_name: str,
     axis: str | None,
+    length: float,
 ) -> Trajectory:
     """Displacements from a reference, and velocities; see :meth:`Frames.trajectory`."""
     _check_alike(name, first, reference, reference_name)
@@ -141,7 +142,7 @@ def displacements(
         for c in columns
     ]
     before = torch.zeros_like(rest)
-    last = first
+    last, numbers = first, []
     for k, frame in enumerate(frames):
         if frame.velocities is None:
             raise checks.fail(
@@ -156,17 +157,18 @@ def displacements(
                 "none",
             )
         u = frame.positions[order][:, columns] - rest
-        for i, (column, length) in enumerate(zip(columns, wraps, strict=True)):
-            if length:
+        for i, (column, side) in enumerate(zip(columns, wraps, strict=True)):
+            if side:
                 _check_box(name, frame, reference, first.axes[column])
-                u[:, i] -= length * ((u[:, i] - before[:, i]) / length).round()
+                u[:, i] -= side * ((u[:, i] - before[:, i]) / side).round()
             elif frame.box is not None and not frame.unwrapped[column]:
                 _check_jump(name, frame, u[:, i], first.axes[column])
         times[k], moved[k], velocity[k], before = frame.time, u, frame.velocities[order][:, columns], u
         last = frame
-    _check_digits(name, last, [first.axes[c] for c in columns], moved)
+        numbers.append(frame.number)
+    _check_digits(name, last, [first.axes[c] for c in columns], moved, length)
     if line is not None:
-        _check_line(name, moved[..., 0], first, reference, order, line, wraps[0])
+        _check_line(name, numbers, moved[..., 0], first, reference, order, line)
         _check_across(name, last, line)
         moved, velocity = moved[..., 0], velocity[..., 0]
     return Trajectory(times - times[0], moved, velocity)
@@ -233,66 +235,95 @@ def _check_jump(name: str, frame: Frame, u: Tensor, axis: str) -> None:
 def significant_digits(values: Tensor) -> int:
     """Decimal digits after which all values end, 5 to 12; 16 if they have more."""
     values = values[values != 0].abs()
+    if not len(values):
+        return 16
+    rounding = 8 * torch.finfo(values.dtype).eps * values.max()
     for digits in range(5, 13):
         unit = 10.0 ** (values.log10().floor() - digits + 1)
-        if bool((((values / unit).round() * unit - values).abs() <= 4 * torch.finfo(values.dtype).eps * values).all()):
+        if bool((((values / unit).round() * unit - values).abs() <= rounding).all()):
             return digits
     return 16
 
 
-def _check_digits(name: str, frame: Frame, axes: list[str], moved: Tensor) -> None:
-    """A warning where the digits of the positions are too few for the displacements."""
-    size = float(moved.square().mean().sqrt())
-    if not size > 0:
-        return
-    positions = frame.positions[:, [frame.axes.index(a) for a in axes]]
-    digits = significant_digits(positions)
-    largest = float(positions.abs().max())
-    if digits >= 12 or largest == 0:
-        return
-    step = 10.0 ** (math.floor(math.log10(largest)) - digits + 1)
-    if step / math.sqrt(12) > NOISE * size:
-        warn(
-            f"{here(name, frame)}: {axes[0]}",
-            f"positions of {digits} digits, hence in steps of {step:g}, for displacements of {size:.2g} (rms): too coarse by a factor of {step / math.sqrt(12) / size / NOISE:.2g}"
-            " (LAMMPS: dump_modify ... format float %.15g)",
-        )
+def _check_digits(name: str, frame: Frame, axes: list[str], moved: Tensor, length: float) -> None:
+    """A warning where the digits of the positions, or of their share of the box, are too few for the displacements."""
+    for column, axis in enumerate(axes):
+        size = float(moved[..., column].square().mean().sqrt()) * length
+        if not size > 0:
+            continue
+        positions = frame.positions[:, frame.axes.index(axis)] * length
+        written = [(positions, 1.0)]
+        if frame.box is not None:
+            i = AXES.index(axis)
+            low, side = frame.box.lower[i] * length, float(frame.box.lengths[i]) * length
+            written += [((positions - low) / side, side)] if side > 0 else []
+        for values, scale in written:
+            digits, largest = significant_digits(values), float(values.abs().max())
+            if digits > 12 or largest == 0:
+                continue
+            step = scale * 10.0 ** (math.floor(math.log10(largest)) - digits + 1)
+            error = step / math.sqrt(12)  # of a value that is rounded, rms
+            if error > NOISE * size:
+                warn(
+                    f"{here(name, frame)}: {axis}",
+                    f"positions of {digits} digits, in steps of {step / length:.2g}, for displacements of {size / length:.2g} (rms): off by {error / size:.1g} of themselves"
+                    " (LAMMPS: dump_modify ... format float %.15g)",
+                )
+                return
 
 
 def _check_line(
-    name: str, moved: Tensor, first: Frame, reference: Frame, order: Tensor, axis: str, length: float
+    name: str, numbers: list[int], moved: Tensor, first: Frame, reference: Frame, order: Tensor, axis: str
 ) -> None:
-    """An error for neighbors that passed each other, a warning for contacts that opened."""
-    rest = reference.positions[order, first.axes.index(axis)]
-    gap = rest.diff()
-    if length:
-        gap = gap.remainder(length)
-    stretch = moved.diff(dim=-1)
+    """An error for neighbors that passed each other, a warning for contacts that opened.
+
+    Args:
+        name: of the file.
+        numbers: of the frames.
+        moved: displacements along the axis, (time, particle).
+        first, reference: the first frame and the state at rest.
+        order: of the chain.
+        axis: of the chain.
+    """
+    rest, ids = reference.positions[order, first.axes.index(axis)], first.ids[order].tolist()
+    period = _period(reference.box, axis)
+    n = len(order)
+    gap, stretch = rest.diff(), moved.diff(dim=-1)
+    if period:
+        gap = (rest.roll(-1) - rest).remainder(period)
+        stretch = moved.roll(-1, -1) - moved
+    wrong = (
+        gap <= 0 if not period else torch.full_like(gap, abs(float(gap.sum()) - period) > period / 2, dtype=torch.bool)
+    )
+    if bool(wrong.any()):
+        raise checks.fail(f"{name}: {axis}", "have the order of the reference in the first frame", "another order")
     crossed = gap + stretch <= 0
     if bool(crossed.any()):
         k, c = (int(i) for i in crossed.nonzero()[0])
         raise checks.fail(
-            f"{name}, frame {first.number + k}: {axis}",
+            f"{name}, frame {numbers[k]}: {axis}",
             "keep the order of the chain",
-            f"ids {int(first.ids[order[c]])} and {int(first.ids[order[c + 1]])} past each other",
+            f"ids {ids[c]} and {ids[(c + 1) % n]} past each other",
         )
     radii = reference.radii if reference.radii is not None else first.radii
     if radii is None:
         return
-    overlap = radii[order][:-1] + radii[order][1:] - gap
-    if bool((overlap <= 0).any()):
-        c = int((overlap <= 0).nonzero()[0])
+    radii = radii[order]
+    overlap = (radii + radii.roll(-1))[: len(gap)] - gap
+    apart = (overlap[: n - 1] <= 0).nonzero()  # the two ends may be
+    if len(apart):
+        c = int(apart[0])
         warn(
             f"{here(name, reference)}: radius",
-            f"ids {int(first.ids[order[c]])} and {int(first.ids[order[c + 1]])} do not touch in the reference, by {-float(overlap[c]):.3g}",
+            f"ids {ids[c]} and {ids[c + 1]} do not touch in the reference, by {-float(overlap[c]):.3g}",
         )
         return
-    opened = stretch >= overlap
+    opened = (stretch >= overlap) & (overlap > 0)
     if bool(opened.any()):
         k, c = (int(i) for i in opened.nonzero()[0])
         warn(
-            f"{name}, frame {first.number + k}: {axis}",
-            f"displacements above the overlap: the contact of ids {int(first.ids[order[c]])} and {int(first.ids[order[c + 1]])} opened (stretched by {float(stretch[k, c]):.3g}, overlap {float(overlap[c]):.3g})",
+            f"{name}, frame {numbers[k]}: {axis}",
+            f"displacements above the overlap: the contact of ids {ids[c]} and {ids[(c + 1) % n]} opened (stretched by {float(stretch[k, c]):.3g}, overlap {float(overlap[c]):.3g})",
         )
 
 

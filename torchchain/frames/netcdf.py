@@ -144,6 +144,13 @@ def _open(path: Path) -> Iterator[Any]:
             raise checks.fail(path.name, "be a whole netCDF file", f"{type(error).__name__}: {error}") from None
 
 
+def _holds(file: Any, name: str) -> bool:
+    """Whether the file has this variable; a dimension alone has a place in it too."""
+    return name in file and not bytes(file[name].attrs.get("NAME", b"")).startswith(
+        b"This is a netCDF dimension but not"
+    )
+
+
 def _scan(path: Path, options: dict[str, Any]) -> Scan:
     with _open(path) as file:
         shape = file["position"].shape
@@ -155,7 +162,7 @@ def _scan(path: Path, options: dict[str, Any]) -> Scan:
             "unwrapped": (d,), "box_lower": (n_frames, 3), "box_upper": (n_frames, 3), "periodic": (3,),
         }  # fmt: skip
         for name, expected in shapes.items():
-            if name not in file:
+            if not _holds(file, name):
                 continue
             if file[name].shape != expected or file[name].dtype.kind not in ("f" if name in FLOATS else "iu"):
                 raise checks.fail(
@@ -165,8 +172,8 @@ def _scan(path: Path, options: dict[str, Any]) -> Scan:
                 )
         if ("box_lower" in file) != ("box_upper" in file) or ("box_lower" in file) != ("periodic" in file):
             raise checks.fail(f"{path.name}: box", "have lower and upper bounds and flags", "some of them")
-        times = file["time"][...].tolist() if "time" in file else [None] * n_frames
-        steps = file["step"][...].tolist() if "step" in file else [None] * n_frames
+        times = file["time"][...].tolist() if _holds(file, "time") else [None] * n_frames
+        steps = file["step"][...].tolist() if _holds(file, "step") else [None] * n_frames
         for k, time in enumerate(times):
             if time is not None and not np.isfinite(time):
                 raise checks.fail(f"{where(path.name, k + 1)}: time", "be a finite number", time)

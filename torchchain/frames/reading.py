@@ -444,7 +444,7 @@ class Frames:
             FramesWarning: for displacements above the overlap, positions of too few digits, and motion across the chain.
         """
         at_rest, name = self._reference(reference)
-        found = motion.displacements(self.name, self, len(self), self.first, at_rest, name, axis)
+        found = motion.displacements(self.name, self, len(self), self.first, at_rest, name, axis, self._unit("length"))
         if chain is not None:
             checks.instance("chain", chain, Chain)
             if found.displacement.ndim != 2 or chain.masses.shape != found.displacement.shape[-1:]:

@@ -61,6 +61,7 @@ class Text:
             self.compressed = file.read(2) == b"\x1f\x8b"
         self._file: Any = gzip.open(path, "rb") if self.compressed else open(path, "rb")  # noqa: SIM115
         self._buffer, self._start, self._ended = b"", 0, False
+        self._broken = False
         self.position = 0
         if position:
             self.seek(position)
@@ -77,7 +78,7 @@ class Text:
         """Go to a byte of the uncompressed text."""
         if position != self.position:
             self._guard(lambda: self._file.seek(position))
-            self._buffer, self._start, self._ended, self.position = b"", 0, False, position
+            self._buffer, self._start, self._ended, self._broken, self.position = b"", 0, False, False, position
 
     def head(self, size: int) -> bytes:
         """The first bytes of the text, as many as there are if a gzip stream breaks off."""
@@ -104,13 +105,32 @@ class Text:
         """Read on; False at the end of the file."""
         if self._ended:
             return False
-        more: bytes = self._guard(lambda: self._file.read(CHUNK))
+        more = self._guard(self._read)
         if not more:
             self._ended = True
             return False
         self._buffer = self._buffer[self._start :] + more
         self._start = 0
         return True
+
+    def _read(self) -> bytes:
+        """About a chunk; of a gzip stream that breaks off first all that there is, then the error."""
+        if not self.compressed:
+            return bytes(self._file.read(CHUNK))
+        parts, size = [], 0
+        while size < CHUNK and not self._broken:
+            try:
+                part = self._file.read1(CHUNK - size)
+            except EOFError:
+                self._broken = True
+                break
+            if not part:
+                break
+            parts.append(part)
+            size += len(part)
+        if self._broken and not parts:
+            raise EOFError
+        return b"".join(parts)
 
     def line(self) -> str | None:
         """The next line without its end, or None at the end of the file. A last line without an end is cut short."""
