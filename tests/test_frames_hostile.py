@@ -304,6 +304,7 @@ RESTARTS = {
     "a mass of words": (swap(RESTART, "invMass 2", "invMass light"), "invMass"),
     "no masses": (RESTART.replace("invMass 2", ""), "invMass"),
     "a negative mass": (swap(RESTART, "invMass 2", "invMass -2"), "invMass"),
+    "an id beyond integers": (swap(RESTART, "id 1", "id " + "9" * 20), "id"),
     "cut short": (RESTART[:-5], "run.restart"),
 }
 

@@ -162,7 +162,7 @@ def _particle(here: str, words: list[str], found: dict[str, list[float]]) -> Non
         word = words[words.index(key) + 1]
         try:
             value = float(word)
-            good = np.isfinite(value) and value >= 0 and (name != "id" or value == int(value))
+            good = 0 <= value < 2**63 and (name != "id" or value == int(value))
         except ValueError:
             good = False
         if not good:

@@ -134,13 +134,15 @@ def _open(path: Path) -> Iterator[Any]:
     except Exception as error:  # h5py lets through many kinds for a damaged file
         raise checks.fail(path.name, "be a whole netCDF file", f"{type(error).__name__}: {error}") from None
     with file:
-        layout = file.attrs.get("layout")
-        if layout != LAYOUT or not {"id", "position", "unwrapped"} <= set(file):
-            words = "none" if layout is None else checks.shown(layout, 40)
-            raise checks.fail(f"{path.name}: layout", f"be '{LAYOUT}' (torchchain convert writes it)", words)
         try:
+            layout = file.attrs.get("layout")
+            if layout != LAYOUT or not {"id", "position", "unwrapped"} <= set(file):
+                words = "none" if layout is None else checks.shown(layout, 40)
+                raise checks.fail(f"{path.name}: layout", f"be '{LAYOUT}' (torchchain convert writes it)", words)
             yield file
-        except (OSError, KeyError, RuntimeError) as error:
+        except (checks.FieldError, checks.FieldTypeError):
+            raise
+        except Exception as error:
             raise checks.fail(path.name, "be a whole netCDF file", f"{type(error).__name__}: {error}") from None
 
 
