@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchchain as tc
-from torchchain import checks, fused
-from torchchain.bands import center_tones
+from torchchain import checks
+from torchchain.energy.bands import center_tones
+from torchchain.ensemble import fused
 from torchchain.threads import single_blas_thread
 
 BANDS, WIDTH = "standing wave: energy in bands", "kick: squared width"

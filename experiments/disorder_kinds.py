@@ -18,10 +18,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchchain as tc
-from torchchain import ensemble, plots
-from torchchain.bands import band_of
-from torchchain.disorder import KINDS
-from torchchain.scene import regular_times
+from torchchain import plots
+from torchchain.chain.disorder import KINDS
+from torchchain.energy.bands import band_of
+from torchchain.ensemble import run as ensemble
+from torchchain.ensemble.scene import regular_times
 
 CASES = (*KINDS, "normal again", "stiffness", "both")  # the second normal ensemble shows what chance does
 NONE = tc.Disorder(strength=0.0)

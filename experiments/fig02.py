@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchchain as tc
-from torchchain import checks, ensemble, plots
+from torchchain import checks, plots
+from torchchain.ensemble import run as ensemble
 
 
 @dataclass(frozen=True)

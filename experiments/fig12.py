@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import torchchain as tc
 from torchchain import plots
-from torchchain.bands import band_of
+from torchchain.energy.bands import band_of
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchchain as tc
-from torchchain import checks, outputs
-from torchchain.scene import read_toml, regular_times
-from torchchain.statistics import jackknife_error
+from torchchain import checks
+from torchchain.cli import outputs
+from torchchain.ensemble.scene import read_toml, regular_times
+from torchchain.ensemble.statistics import jackknife_error
 
 TIME = {"units": "travel time of sound over one particle", "long_name": "time t"}
 RATE = {"units": "1 / travel time of sound over one particle"}

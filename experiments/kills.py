@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from safetensors.torch import load_file
 
 from torchchain import checks, cli
-from torchchain.statistics import EnsembleMoments, joined
+from torchchain.ensemble.statistics import EnsembleMoments, joined
 
 COMMANDS = ("simulate", "calibrate")
 N_BLOCKS = {"simulate": 1, "calibrate": 20}
@@ -59,7 +59,7 @@ def arguments(config: Config, command: str, out: Path) -> list[str]:
 
 
 SERVER = multiprocessing.get_context("forkserver")  # forks processes that hold the libraries already
-SERVER.set_forkserver_preload(["torchchain.commands", "torchchain.evolvers.stencil", "__main__"])
+SERVER.set_forkserver_preload(["torchchain.cli.dispatch", "torchchain.evolvers.stencil", "__main__"])
 
 
 def _run(command: list[str]) -> None:

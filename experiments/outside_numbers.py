@@ -22,7 +22,7 @@ from torch import Tensor
 
 import torchchain as tc
 from torchchain import plots
-from torchchain.fused import energy_moments
+from torchchain.ensemble.fused import energy_moments
 
 METHODS = ("modes", "tridiagonal", "chebyshev")
 KICKS = {

@@ -16,11 +16,12 @@ from harness import Row
 from matplotlib.figure import Figure
 
 import torchchain as tc
-from torchchain import checks, planning
-from torchchain.machine import Machine, this_machine
-from torchchain.planning import Choice
-from torchchain.predictions import Facts, error_of, seconds, settle
-from torchchain.scene import describe, regular_times
+from torchchain import checks
+from torchchain.ensemble import plan as planning
+from torchchain.ensemble.machine import Machine, this_machine
+from torchchain.ensemble.plan import Choice
+from torchchain.ensemble.predictions import Facts, error_of, seconds, settle
+from torchchain.ensemble.scene import describe, regular_times
 
 IN_SPACE = ("center", "width", "energy", "displacement", "total_energy", "source_energy")
 LAWS = ("linear",) * 12 + ("damped",) * 3 + ("hertz",) * 4 + ("hertz damped",)

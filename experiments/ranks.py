@@ -21,7 +21,8 @@ from harness import Row
 from matplotlib.figure import Figure
 
 import torchchain as tc
-from torchchain import checks, ranks
+from torchchain import checks
+from torchchain.ensemble import ranks
 
 METHODS = ("modes", "chebyshev")
 WAYS = {"1 process, 1 thread": (1, 1), "2 processes, 1 thread each": (2, 1), "1 process, 2 threads": (1, 2)}

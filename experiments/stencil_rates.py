@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from numba import njit
 
 import torchchain as tc
-from torchchain import fused
-from torchchain.evolvers import chebyshev, stencil
+from torchchain.ensemble import fused
+from torchchain.evolvers import chebyshev, expansion, stencil
 from torchchain.threads import single_thread
 
 
@@ -88,7 +88,7 @@ def in_turn(
 
 def terms_at(frequency: float, time: float) -> int:
     """Terms of the expansion that the kernels take for one time, to rounding."""
-    return stencil._coefficients(frequency, time, chebyshev.ROUNDING, np.empty(1000), *np.empty((3, 1000)))
+    return stencil._coefficients(frequency, time, expansion.ROUNDING, np.empty(1000), *np.empty((3, 1000)))
 
 
 def rates(config: Config, n: int) -> dict[str, list[float]]:
@@ -101,16 +101,16 @@ def rates(config: Config, n: int) -> dict[str, list[float]]:
     batch = tc.Chain(chain.masses.repeat(copies, 1), "fixed")
     many = tc.State(state.displacement.repeat(copies, 1), state.velocity.repeat(copies, 1))
     frequency = chebyshev.highest_frequency(chain).item()
-    terms = terms_at(frequency, chebyshev.LEAP / frequency)
+    terms = terms_at(frequency, expansion.LEAP / frequency)
     leaps = max(1, round(config.updates / (2 * terms * n)))
     fewer = max(1, leaps // copies)
     pairs = leaps * terms
-    leap = (1 - 1e-9) * chebyshev.LEAP / frequency
+    leap = (1 - 1e-9) * expansion.LEAP / frequency
     rows = np.zeros((2, n + 2))
     rows[:, 1:-1] = state.velocity.numpy()
     weight = np.zeros(n + 2)
     weight[1:-1] = 4 / (frequency**2 * chain.masses[0].numpy())
-    options = {"accuracy": chebyshev.ROUNDING}
+    options = {"accuracy": expansion.ROUNDING}
     ways = {
         "bare": lambda: bare(rows[0], rows[1], weight, n, pairs),
         "kernels": lambda: tc.evolve(chain, state, [leaps * leap], "chebyshev", **options),
@@ -129,7 +129,7 @@ def impulse_updates(config: Config, frequency: float) -> tuple[float, float]:
 
     No more particles are counted than sound has reached, though the kernels go a little beyond.
     """
-    count = min(chebyshev.LONGEST, int(chebyshev.REACH / frequency))
+    count = min(expansion.LONGEST, int(expansion.REACH / frequency))
     terms = np.array([terms_at(frequency, 1.0 + j) for j in range(count)])
     reached = np.minimum(np.arange(0, config.stop, count), config.n_particles).sum()
     return reached * terms.max(), reached * 2 * terms.sum()

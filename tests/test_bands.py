@@ -4,8 +4,8 @@ import torch
 from literal import bands
 
 import torchchain as tc
-from torchchain.bands import band_of, center_tones, check_bands
 from torchchain.checks import FieldError, FieldTypeError
+from torchchain.energy.bands import band_of, center_tones, check_bands
 
 
 def test_the_papers_tones():

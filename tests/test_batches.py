@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import torchchain as tc
+from torchchain.chain.amplitude import LinearityWarning
 from torchchain.checks import FieldError
 from torchchain.evolvers import METHODS
 from torchchain.evolvers.drift import EnergyDriftError
-from torchchain.evolvers.linearity import LinearityWarning
 
 TIMES = torch.tensor([0.0, 0.4, 1.0, 3.0], dtype=torch.float64)
 BITWISE = ("chebyshev", "verlet", "symplectic4")
@@ -112,7 +112,7 @@ def test_neighbors_in_the_batch_do_not_matter(name, order):
 @pytest.mark.parametrize("boundary", ["periodic", "fixed"])
 @pytest.mark.parametrize("definition", ["site", "bond"])
 def test_fused_observables_of_a_chain_alone(boundary, definition):
-    from torchchain import fused
+    from torchchain.ensemble import fused
 
     chain = batch(boundary)
     state = starts(chain)

@@ -10,9 +10,9 @@ import torch
 from scipy import special
 
 import torchchain as tc
-from torchchain import fused
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.evolvers import chebyshev, start
+from torchchain.ensemble import fused
+from torchchain.evolvers import chebyshev, expansion, start
 
 BOUNDARIES = ("fixed", "periodic")
 IMPLEMENTATIONS = [pytest.param(True, id="compiled"), pytest.param(False, id="torch")]
@@ -255,7 +255,7 @@ def test_coefficients():
     """The table of both implementations: the functions at the ends of the spectrum, and a sum that is the motion at x."""
     frequency = np.array([0.7, 2.0, 5.3])
     for time in (1e-9, 0.01, 1.0, 40.0):
-        table = chebyshev.coefficients(frequency, np.full(3, time), 1e-16)
+        table = expansion.coefficients(frequency, np.full(3, time), 1e-16)
         assert table.sum(1) == pytest.approx(np.array([[1.0] * 3, [time] * 3, [0.0] * 3]), rel=1e-14, abs=1e-14)
         angle = np.linspace(0, np.pi, 7)[:, None]
         polynomials = np.cos(np.arange(table.shape[1]) * angle)
@@ -270,7 +270,7 @@ def test_kernels_have_the_same_coefficients():
     from torchchain.evolvers import stencil
 
     for frequency, time in ((2.0, 1e-8), (2.0, 1.0), (3.7, 3.0), (5.0, 50.0)):
-        expected = chebyshev.coefficients(np.array([frequency]), np.array([time]), 1e-16)[..., 0]
+        expected = expansion.coefficients(np.array([frequency]), np.array([time]), 1e-16)[..., 0]
         table = np.zeros((3, 200))
         terms = stencil._coefficients(frequency, time, 1e-16, np.empty(400), *table)
         assert terms % 2 == 0

@@ -20,9 +20,14 @@ import xarray
 from safetensors.torch import load_file
 
 import torchchain as tc
-from torchchain import checkpoint, cli, commands, ensemble
-from torchchain.checkpoint import Checkpoint, CheckpointWarning
+from torchchain import cli
 from torchchain.checks import FieldError
+from torchchain.cli import outputs
+from torchchain.ensemble import checkpoint
+from torchchain.ensemble import run as ensemble
+from torchchain.ensemble.checkpoint import Checkpoint, CheckpointWarning
+from torchchain.ensemble.chunk import Chunk
+from torchchain.ensemble.statistics import EnsembleMoments
 
 SCENE = tc.Scene(n_particles=16, n_bands=4, realizations=40, seed=3, times=[0.0, 1.0, 7.0])
 FLAGS = "--n-particles 16 --n-bands 4 --realizations 40 --times.stop 5 --seed 3 --method modes".split()
@@ -32,7 +37,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:prediction to time")
 
 @pytest.fixture
 def no_drawing(monkeypatch):
-    monkeypatch.setattr(commands.outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
+    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
 
 
 def data_of(folder):
@@ -50,14 +55,14 @@ def data_of(folder):
 
 def stopped_after(chunks, monkeypatch, stop=KeyboardInterrupt):
     """The run is interrupted when it has measured so many chunks."""
-    observe, left = ensemble.Chunk.observe, itertools.count(chunks, -1)
+    observe, left = Chunk.observe, itertools.count(chunks, -1)
 
     def counted(chunk, names):
         if next(left) <= 0:
             raise stop
         return observe(chunk, names)
 
-    monkeypatch.setattr(ensemble.Chunk, "observe", counted)
+    monkeypatch.setattr(Chunk, "observe", counted)
 
 
 def equal(a, b):
@@ -82,14 +87,14 @@ def whole():
 
 
 SERVER = multiprocessing.get_context("forkserver")  # forks from a process that has no threads yet
-SERVER.set_forkserver_preload(["torchchain.commands", "test_checkpoint"])
+SERVER.set_forkserver_preload(["torchchain.cli.dispatch", "test_checkpoint"])
 
 
 def command_in_a_process(arguments, prepare):
     silent = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silent, 1)
     os.dup2(silent, 2)
-    commands.outputs.figure = lambda drawn: lambda path: path.write_bytes(b"")
+    outputs.figure = lambda drawn: lambda path: path.write_bytes(b"")
     prepare()
     os._exit(cli.main(arguments))
 
@@ -124,10 +129,12 @@ MOMENTS = [
     pytest.param("os", "replace", 7, False, id="before a part is replaced"),
     pytest.param("os", "replace", 7, True, id="after a part is replaced"),
     pytest.param("os", "fsync", 9, False, id="in a part that is half written"),
-    pytest.param("torchchain.ensemble:EnsembleMoments", "absorb", 5, True, id="between chunks"),
-    pytest.param("torchchain.outputs", "write", 0, False, id="before the results are written"),
-    pytest.param("torchchain.outputs", "sha256", 2, True, id="while the results are written"),
-    pytest.param("torchchain.checkpoint:Checkpoint", "clear", 0, False, id="with results and checkpoint both there"),
+    pytest.param("torchchain.ensemble.run:EnsembleMoments", "absorb", 5, True, id="between chunks"),
+    pytest.param("torchchain.cli.outputs", "write", 0, False, id="before the results are written"),
+    pytest.param("torchchain.cli.outputs", "sha256", 2, True, id="while the results are written"),
+    pytest.param(
+        "torchchain.ensemble.checkpoint:Checkpoint", "clear", 0, False, id="with results and checkpoint both there"
+    ),
 ]
 
 
@@ -163,7 +170,7 @@ def test_killed_and_resumed(command, owner, name, count, after, reference, tmp_p
 def test_killed_again_and_again(reference, tmp_path):
     arguments = ["simulate", *FLAGS, *EVERY, "--out", str(tmp_path / "out")]
     for _ in range(6):
-        killing = partial(killed_at, "torchchain.ensemble:EnsembleMoments", "absorb", 3, False)
+        killing = partial(killed_at, "torchchain.ensemble.run:EnsembleMoments", "absorb", 3, False)
         assert forked(arguments, killing) == -signal.SIGKILL
         assert len(os.listdir(tmp_path / "out" / "checkpoint")) <= 2  # what came before, and the session's own
     assert cli.main(arguments) == 0
@@ -195,7 +202,7 @@ def test_ctrl_c(tmp_path):
     assert os.listdir(tmp_path / "out") == ["checkpoint"]
     kept = int(errors.split()[3])
     (part,) = folder.iterdir()
-    moments = ensemble.EnsembleMoments.from_tensors(100_000, 1, load_file(part))
+    moments = EnsembleMoments.from_tensors(100_000, 1, load_file(part))
     assert moments.held() == [range(kept)]
 
 
@@ -271,7 +278,7 @@ def test_few_numbers_are_kept(tmp_path):
     scene = replace(SCENE, realizations=1023, observables=("center",))
     with pytest.MonkeyPatch.context() as patch:
         stopped_after(1000, patch)
-        patch.setattr(ensemble, "GROUPS", 10_000)  # one chain a chunk
+        patch.setattr("torchchain.ensemble.layout.GROUPS", 10_000)  # one chain a chunk
         with pytest.raises(KeyboardInterrupt, match="1000 of 1023"):
             tc.simulate(scene, "modes", checkpoint=Checkpoint(tmp_path, 1e-9))
     (part,) = tmp_path.iterdir()
@@ -408,7 +415,7 @@ def test_a_disk_that_fills_up_keeps_the_checkpoint(reference, tmp_path, monkeypa
 
     arguments = ["simulate", *FLAGS, *EVERY, "--out", "out"]
     with monkeypatch.context() as patch:
-        patch.setattr(commands.outputs, "dataset", full)
+        patch.setattr(outputs, "dataset", full)
         assert cli.main(arguments) == 2
     assert "out must be writable, got out: No space left on device" in capsys.readouterr().err
     assert os.listdir("out") == ["checkpoint"]
@@ -437,10 +444,10 @@ def test_pairs_are_resumed(tmp_path, monkeypatch):
 
 def test_nodes_go_through_files_unchanged(tmp_path):
     values = torch.randn(13, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    moments = ensemble.EnsembleMoments(13, 3)
+    moments = EnsembleMoments(13, 3)
     moments.add(0, {"a": values[:6], "b": values[:6, 0]})
     moments.add(9, {"a": values[9:], "b": values[9:, 0]})
-    again = ensemble.EnsembleMoments.from_tensors(13, 3, moments.tensors())
+    again = EnsembleMoments.from_tensors(13, 3, moments.tensors())
     assert again.held() == moments.held() == [range(6), range(9, 13)]
     for part in (moments, again):
         part.add(6, {"a": values[6:9], "b": values[6:9, 0]})

@@ -12,8 +12,9 @@ import torch
 import xarray
 
 import torchchain as tc
-from torchchain import cli, commands
-from torchchain.spectrum import DecompositionError
+from torchchain import cli
+from torchchain.cli import outputs
+from torchchain.modes.spectrum import DecompositionError
 
 SMALL = "--n-particles 32 --n-bands 4 --realizations 4 --times.stop 5 --seed 5 --method modes".split()
 
@@ -34,7 +35,7 @@ def run(tmp_path, monkeypatch, capsys):
 @pytest.fixture
 def no_drawing(monkeypatch):
     """Figures are made but not rendered, which takes longer than all the rest of a small run."""
-    monkeypatch.setattr(commands.outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
+    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
 
 
 @pytest.fixture(scope="module")
@@ -387,7 +388,7 @@ def test_bad_flags_of_calibrate(flags, message, run, monkeypatch):
         def computed(*arguments, **settings):
             pytest.fail("an ensemble was computed before the flags were checked")
 
-        monkeypatch.setattr(commands, "band_transfer", computed)
+        monkeypatch.setattr("torchchain.cli.calibrate.band_transfer", computed)
     assert message in complains(run("calibrate", *SMALL, *flags.split(), "--out", "out"))
 
 
@@ -513,7 +514,7 @@ def test_places_that_cannot_be_written(run, tmp_path, calibrated, monkeypatch):
     def computed(*arguments, **settings):
         pytest.fail("a simulation ran before its folder was checked")
 
-    monkeypatch.setattr(commands, "simulate", computed)
+    monkeypatch.setattr("torchchain.cli.simulate.simulate", computed)
     (tmp_path / "file").write_text("mine")
     (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
     for out, message in (
@@ -541,7 +542,7 @@ def test_a_write_that_fails_leaves_nothing(run, monkeypatch, tmp_path):
 
         return writer
 
-    monkeypatch.setattr(commands.outputs, "dataset", full)
+    monkeypatch.setattr(outputs, "dataset", full)
     assert "out must be writable, got out: No space left on device" in complains(
         run("simulate", *SMALL, "--out", "out")
     )
@@ -565,7 +566,7 @@ def test_failures_that_are_not_the_users(failure, status, message, run, monkeypa
     def fails(*arguments, **settings):
         raise failure
 
-    monkeypatch.setattr(commands, "simulate", fails)
+    monkeypatch.setattr("torchchain.cli.simulate.simulate", fails)
     assert message in complains(run("simulate", *SMALL, "--out", "out"), status)
 
 

@@ -4,8 +4,8 @@ import torch
 from scipy import stats
 
 import torchchain as tc
+from torchchain.chain.disorder import KINDS
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.disorder import KINDS
 
 MANY = 400_000  # values per kind: the standard error of a mean is xi / 632
 

@@ -9,8 +9,10 @@ import xarray
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.ensemble import Stages, layout, stream
-from torchchain.scene import OBSERVABLES, describe
+from torchchain.ensemble.layout import layout
+from torchchain.ensemble.run import stream
+from torchchain.ensemble.scene import OBSERVABLES, describe
+from torchchain.ensemble.stages import Stages
 
 TIMES = [0.0, 0.7, 5.0, 90.0]
 

@@ -12,12 +12,12 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.evolvers.phase import PhaseWarning
 from torchchain.evolvers.symplectic import MOST_STEPS
 from torchchain.master.calibration import Calibration
 from torchchain.master.equation import TrustWarning
 from torchchain.master.fits import FitWarning, nonlinear_rates
-from torchchain.spectrum import DecompositionError, SpectrumWarning
+from torchchain.modes.phase import PhaseWarning
+from torchchain.modes.spectrum import DecompositionError, SpectrumWarning
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "experiments"))
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 import torchchain as tc
-from torchchain import cli, footprint
+from torchchain import cli
 from torchchain.checks import FieldError
-from torchchain.ensemble import IN_TIME
+from torchchain.ensemble import footprint
+from torchchain.ensemble.observables import IN_TIME
 
 AXES = {name: entry.axes for name, entry in IN_TIME.items()}
 LONG = torch.arange(10**7, dtype=torch.float64) / 1e6

@@ -8,9 +8,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchchain as tc
-from torchchain.evolvers import METHODS, drift, symplectic
-from torchchain.evolvers.drift import EnergyDriftError
-from torchchain.evolvers.linearity import (
+from torchchain.chain.amplitude import (
     LinearityWarning,
     elongation_bound,
     elongation_estimate,
@@ -18,6 +16,8 @@ from torchchain.evolvers.linearity import (
     linearity,
     warn_if_nonlinear,
 )
+from torchchain.evolvers import METHODS, drift, symplectic
+from torchchain.evolvers.drift import EnergyDriftError
 from torchchain.evolvers.verlet import VERLET
 
 HERTZ = [name for name, entry in METHODS.items() if "hertz" in entry.contacts]

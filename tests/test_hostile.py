@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
+from torchchain.ensemble.machine import Machine
 from torchchain.evolvers import ode
 from torchchain.evolvers.drift import EnergyDriftError
-from torchchain.machine import Machine
 from torchchain.master import IntegrationError
-from torchchain.spectrum import DecompositionError
+from torchchain.modes.spectrum import DecompositionError
 
 SOON = 10.0
 """Seconds of an answer, on a machine busy with other things; a second where it is not."""

@@ -22,8 +22,9 @@ import xarray
 from safetensors.torch import load_file, save_file
 
 import torchchain as tc
-from torchchain import cli, commands
+from torchchain import cli
 from torchchain.checks import FieldError, FieldTypeError
+from torchchain.cli import flags, outputs
 
 SOON = 10.0
 SMALL = "--n-particles 16 --n-bands 4 --realizations 4 --times.stop 6 --times.step 0.5 --method modes".split()
@@ -83,32 +84,31 @@ def nothing_computed(monkeypatch):
     def stop(*arguments, **settings):
         raise Reached("reached")
 
-    for name in ("simulate", "band_transfer"):
-        monkeypatch.setattr(commands, name, stop)
-    monkeypatch.setattr(commands.planning, "plan", stop)
-    monkeypatch.setattr(commands.planning, "resolved", lambda scene: scene)
+    for place in ("simulate.simulate", "calibrate.band_transfer", "dispatch.plan"):
+        monkeypatch.setattr(f"torchchain.cli.{place}", stop)
+    monkeypatch.setattr("torchchain.ensemble.plan.resolved", lambda scene: scene)
     monkeypatch.setattr(tc.MasterEquation, "solve", stop)
 
 
 # Every flag of every command
 
 
-def flags(kind, prefix=""):
+def flags_of(kind, prefix=""):
     """The flags of a command and of its tables."""
     for entry in dataclasses.fields(kind):
-        inner = cli.__dict__.get(str(entry.type))
+        inner = flags.__dict__.get(str(entry.type))
         if dataclasses.is_dataclass(inner):
-            yield from flags(inner, f"{prefix}{entry.name}.")
+            yield from flags_of(inner, f"{prefix}{entry.name}.")
         else:
             yield prefix + entry.name
 
 
 WORDS = ("nan", "-inf", "-1", "1e300", "1e-300", "word", "", "99999999999999999999")
-SHARED = set(flags(cli.SceneFlags))
+SHARED = set(flags_of(flags.SceneFlags))
 EVERY_FLAG = [
     (command, flag)
-    for command, kind in cli.COMMANDS.items()
-    for flag in flags(kind)
+    for command, kind in flags.COMMANDS.items()
+    for flag in flags_of(kind)
     if not (command != "simulate" and flag in SHARED)
     and (command, flag) not in {("predict", "model"), ("rerun", "folder"), ("family", "models")}
 ]
@@ -280,7 +280,7 @@ def test_a_folder_that_cannot_be_written_is_found_out(out, run, tmp_path):
 
 
 def test_a_link_to_a_folder_is_followed(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(commands.outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
+    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
     status, _, errors = run("simulate", *SMALL, "--observables", "center", "--out", "link")

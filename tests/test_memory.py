@@ -7,7 +7,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.ensemble import BandTransfer
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.memory import fit_memory
 
 B = 4

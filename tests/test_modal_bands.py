@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchchain as tc
-from torchchain.modal_bands import modal_band_energy
+from torchchain.energy.modal_bands import modal_band_energy
 
 N, BANDS = 32, 8
 TIMES = [0.0, 1.0, 50.0, 5000.0]

@@ -8,7 +8,7 @@ import torch
 from scipy import special
 
 import torchchain as tc
-from torchchain.fused import energy_moments
+from torchchain.ensemble.fused import energy_moments
 
 EXACT = ("modes", "tridiagonal", "chebyshev")
 BALLISTIC = 32 / (15 * math.pi)

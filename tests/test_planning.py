@@ -7,13 +7,16 @@ import pytest
 import torch
 
 import torchchain as tc
-from torchchain import ensemble, machine, planning
 from torchchain.checks import FieldError
-from torchchain.cli import main
-from torchchain.machine import Machine
-from torchchain.planning import forecast
-from torchchain.reach import ReachExceeded, reach
-from torchchain.scene import regular_times
+from torchchain.cli.entry import main
+from torchchain.ensemble import machine
+from torchchain.ensemble import plan as planning
+from torchchain.ensemble import run as ensemble
+from torchchain.ensemble.machine import Machine
+from torchchain.ensemble.plan import forecast
+from torchchain.ensemble.reach import ReachExceeded, reach
+from torchchain.ensemble.scene import regular_times
+from torchchain.master.coverage import plan
 
 TYPICAL = Machine(compilation=0.0, loading=0.0)
 
@@ -37,7 +40,7 @@ def scene(**fields):
     ],
 )
 def test_only_methods_that_can_treat_the_scene(fields, methods):
-    found = planning.plan(scene(**fields), TYPICAL)
+    found = plan(scene(**fields), TYPICAL)
     assert {found.method, *(other.method for other in found.runners_up)} == methods
 
 
@@ -46,7 +49,7 @@ def test_only_methods_that_can_treat_the_scene(fields, methods):
 def test_error_of_a_planned_step_is_within_the_tolerance(tolerance, method):
     """The step that the plan would give, against the exact modes: energies per particle relative to the largest."""
     wanted = scene(tolerance=tolerance)
-    planned = planning.plan(wanted, TYPICAL)
+    planned = plan(wanted, TYPICAL)
     choices = {choice.method: choice for choice in planned.runners_up} | {planned.method: planned}
     chain = wanted.chain(range(4))
     start = wanted.state(chain)
@@ -71,15 +74,15 @@ WHOLE = {"excitation": tc.StandingWave(tones=(7,)), "observables": ("energy",), 
     ],
 )
 def test_clear_cut_scenes(fields, method):
-    assert planning.plan(scene(**fields), TYPICAL).method == method
+    assert plan(scene(**fields), TYPICAL).method == method
 
 
 def test_a_cold_kernel_is_not_compiled_for_a_small_job():
-    assert planning.plan(scene(), Machine()).method in ("modes", "tridiagonal")
+    assert plan(scene(), Machine()).method in ("modes", "tridiagonal")
 
 
 def test_float32_only_where_the_tolerance_allows_it():
-    loose, tight = (planning.plan(scene(n_particles=512, contact="hertz", tolerance=t), TYPICAL) for t in (1e-2, 1e-9))
+    loose, tight = (plan(scene(n_particles=512, contact="hertz", tolerance=t), TYPICAL) for t in (1e-2, 1e-9))
     assert loose.dtype == torch.float32
     assert loose.run_options["dtype"] == "float32"
     assert tight.dtype == torch.float64
@@ -94,7 +97,7 @@ def test_float32_as_chosen_keeps_to_the_tolerance():
         observables=("energy",),
         excitation=tc.Impulse(site=200, velocity=0.3),
     )
-    chosen = planning.plan(wanted, TYPICAL)
+    chosen = plan(wanted, TYPICAL)
     assert chosen.dtype == torch.float32
     found = tc.simulate(wanted, chosen.method, options=chosen.run_options).energy
     exact = tc.simulate(wanted, "verlet", options={"step": 0.004}).energy
@@ -114,7 +117,7 @@ VARIED = [
 def test_predicted_errors_are_bounds(fields, tolerance):
     """Every way that the plan lists, against another exact one."""
     wanted = scene(**fields, tolerance=tolerance)
-    for choice in planning.plan(wanted, TYPICAL).choices:
+    for choice in plan(wanted, TYPICAL).choices:
         options = {**choice.options, **({"dtype": "float32"} if choice.dtype == torch.float32 else {})}
         if not choice.good or options.get("step", 1.0) < 1e-3:
             continue
@@ -126,14 +129,14 @@ def test_predicted_errors_are_bounds(fields, tolerance):
 
 
 def test_without_a_tolerance_the_ensemble_sets_it():
-    few, many = (planning.plan(scene(realizations=r), TYPICAL) for r in (4, 400))
+    few, many = (plan(scene(realizations=r), TYPICAL) for r in (4, 400))
     assert few.tolerance == pytest.approx(10 * many.tolerance)
     assert "ensemble's own error" in few.reasons[0]
 
 
 def test_without_a_tolerance_the_method_adds_little_to_the_error_of_the_ensemble():
     wanted = scene(realizations=40, observables=("energy",), excitation=tc.Impulse(site=32))
-    planned = planning.plan(wanted)
+    planned = plan(wanted)
     assert planned.predicted_error <= planned.tolerance
     exact = tc.simulate(wanted, "modes")
     found = tc.simulate(wanted)
@@ -144,13 +147,13 @@ def test_without_a_tolerance_the_method_adds_little_to_the_error_of_the_ensemble
 
 def test_impossible_tolerance_is_refused_with_the_reachable_one():
     with pytest.raises(FieldError, match=r"tolerance must be at least .* method"):
-        planning.plan(scene(tolerance=1e-15), TYPICAL)
+        plan(scene(tolerance=1e-15), TYPICAL)
 
 
 def test_auto_gives_what_the_plan_names():
     wanted = scene(realizations=3)
     tc.simulate(wanted, "chebyshev")  # loads the kernels, which the plan counts
-    named = planning.plan(wanted)
+    named = plan(wanted)
     torch.testing.assert_close(
         torch.from_numpy(tc.simulate(wanted).center.values),
         torch.from_numpy(tc.simulate(wanted, named.method, options=named.run_options).center.values),
@@ -169,7 +172,7 @@ def test_a_spoiled_machine_record_is_measured_again(tmp_path, monkeypatch, conte
 
 
 def test_plan_prints_its_reasons_and_runners_up():
-    text = str(planning.plan(scene(), TYPICAL))
+    text = str(plan(scene(), TYPICAL))
     for word in ("method", "tolerance", "error", "time", "because", "runner-up"):
         assert word in text
 
@@ -179,7 +182,7 @@ def test_contact_law_follows_the_amplitude(velocity, law):
     wanted = scene(
         contact="auto", tolerance=1e-2, excitation=tc.Impulse(site=20, velocity=velocity), observables=("energy",)
     )
-    planned = planning.plan(wanted, TYPICAL)
+    planned = plan(wanted, TYPICAL)
     assert planned.scene.contact == planning.resolved(wanted).contact == law
     assert law in planned.reasons[1].lower()
     if law == "linear":  # the contact that was left out would have made no more difference than was allowed
@@ -251,14 +254,14 @@ def transfer_scene(**fields):
 @pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
 def test_a_calibrated_model_takes_the_place_of_the_chains_where_it_covers_the_scene(master, tmp_path):
     wanted = transfer_scene(tolerance=0.2, times=regular_times(0.0, 40.0, 0.01), realizations=1000)
-    planned = planning.plan(wanted, TYPICAL, artifact=master)
+    planned = plan(wanted, TYPICAL, artifact=master)
     assert planned.method == planning.ARTIFACT
     exact = tc.band_transfer(replace(wanted, times=regular_times(0.0, 40.0, 1.0)), "modes", long_time=False)
     found = master.solve(torch.eye(4, dtype=torch.float64), exact.times).detach()
     assert float((found - exact.mean).abs().max()) <= 0.2
     file = tmp_path / "q.safetensors"
     master.save(file)
-    again = planning.plan(wanted, TYPICAL, artifact=file)
+    again = plan(wanted, TYPICAL, artifact=file)
     assert again.method == planning.ARTIFACT
     assert again.predicted_error == pytest.approx(planned.predicted_error)
 
@@ -275,7 +278,7 @@ def test_a_calibrated_model_takes_the_place_of_the_chains_where_it_covers_the_sc
     ],
 )
 def test_a_calibrated_model_that_does_not_fit_is_named_and_left(master, fields, words):
-    planned = planning.plan(transfer_scene(**fields), TYPICAL, artifact=master)
+    planned = plan(transfer_scene(**fields), TYPICAL, artifact=master)
     assert planned.method != planning.ARTIFACT
     assert words in planned.reasons[-1]
 
@@ -318,7 +321,7 @@ def test_chains_too_long_for_the_memory_of_a_method_leave_it_out():
     wanted = scene(
         n_particles=300_000, excitation=tc.StandingWave(tones=(100_000,)), times=torch.tensor([10.0]), tolerance=1e-6
     )
-    planned = planning.plan(wanted, TYPICAL)
+    planned = plan(wanted, TYPICAL)
     assert planned.method == "chebyshev"
     assert not {"modes", "tridiagonal"} & {other.method for other in planned.runners_up}
 

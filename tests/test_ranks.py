@@ -10,10 +10,12 @@ import torch
 import xarray
 
 import torchchain as tc
-from torchchain import cli, commands, ranks
-from torchchain.checkpoint import Checkpoint
-from torchchain.ranks import ALONE, Ranks
-from torchchain.statistics import joined
+from torchchain import cli
+from torchchain.cli import outputs
+from torchchain.ensemble import ranks
+from torchchain.ensemble.checkpoint import Checkpoint
+from torchchain.ensemble.ranks import ALONE, Ranks
+from torchchain.ensemble.statistics import joined
 
 FLAGS = "--n-particles 16 --n-bands 4 --realizations 45 --times.stop 5 --seed 3 --method modes".split()
 pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
@@ -37,7 +39,7 @@ def data_of(path):
 @pytest.fixture
 def alone(tmp_path, monkeypatch):
     """Run the command in this process, without drawing."""
-    monkeypatch.setattr(commands.outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
+    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
 
     def run(*arguments, out):
         assert cli.main([*arguments, "--out", str(tmp_path / out)]) == 0
@@ -61,7 +63,8 @@ def test_two_processes(tmp_path, alone):
 
 DEATH = """
 import itertools, os, signal, sys
-from torchchain import cli, ensemble
+from torchchain import cli
+from torchchain.ensemble import run as ensemble
 
 absorb, left = ensemble.EnsembleMoments.absorb, itertools.count(4, -1)
 

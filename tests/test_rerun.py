@@ -9,8 +9,10 @@ import pytest
 import xarray
 from safetensors.numpy import load_file, save_file
 
-from torchchain import cli, commands, outputs
-from torchchain.rerun import difference
+from torchchain import cli
+from torchchain.cli import outputs
+from torchchain.cli.rerun import difference
+from torchchain.ensemble import plan as planning
 
 SMALL = "--n-particles 16 --n-bands 4 --realizations 6 --times.stop 5 --seed 5".split()
 pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
@@ -27,7 +29,7 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
-        patch.setattr(commands.planning, "plan", planned(commands.planning.plan, "verlet", {"step": 0.05}))
+        patch.setattr(planning, "plan", planned(planning.plan, "verlet", {"step": 0.05}))
         patch.chdir(folder)
         assert cli.main(["simulate", *SMALL, "--observables", "energy", "center", "--out", "simulate"]) == 0
         patch.undo()

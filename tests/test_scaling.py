@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import torchchain as tc
+from torchchain.chain.scaling import QUANTITIES
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.scaling import QUANTITIES
 
 STEEL = {"radius": 5e-3, "density": 7800.0, "young_modulus": 210e9, "poisson_ratio": 0.3, "force": 10.0}
 GLASS = {"radius": 1e-3, "density": 2500.0, "young_modulus": 70e9, "poisson_ratio": 0.2, "force": 0.1}

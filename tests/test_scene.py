@@ -3,7 +3,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.scene import describe, read_toml, regular_times
+from torchchain.ensemble.scene import describe, read_toml, regular_times
 
 
 def test_the_defaults_are_the_papers_case():

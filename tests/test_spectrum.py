@@ -8,7 +8,7 @@ from literal import stiffness_matrix
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.spectrum import DecompositionError, checked_modes
+from torchchain.modes.spectrum import DecompositionError, checked_modes
 
 EPS = np.finfo(float).eps
 

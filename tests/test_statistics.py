@@ -3,7 +3,7 @@ import pytest
 import torch
 
 import torchchain as tc
-from torchchain.statistics import Moments, MomentTree
+from torchchain.ensemble.statistics import Moments, MomentTree
 
 
 def values(count, seed=0):

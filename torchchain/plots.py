@@ -135,3 +135,11 @@ def exponents(ax: Axes, x: np.ndarray, fits: Sequence[Any], xlabel: str) -> Axes
     ax.plot(x, [fit.upper for fit in fits], "^", color="C3", mfc="none", label="upper half")
     ax.set(xlabel=xlabel, ylabel="exponent")
     return ax
+
+
+def figure(width: float, height: float, rows: int, columns: int) -> Any:
+    """A figure and its axes (row, column)."""
+    import matplotlib.figure
+
+    figure = matplotlib.figure.Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)

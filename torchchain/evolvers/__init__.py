@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from torchchain import checks
-from torchchain.chain import Chain
-from torchchain.evolvers import chebyshev, damped, linearity, modes, ode, symplectic4, tridiagonal, verlet
-from torchchain.evolvers.method import Advance, Method, Trajectory
-from torchchain.excitation import State
+from torchchain.chain import amplitude
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State, Trajectory
+from torchchain.evolvers import chebyshev, damped, modes, ode, symplectic4, tridiagonal, verlet
+from torchchain.evolvers.method import Advance, Method
 
 METHODS: dict[str, Method] = {
     entry.name: entry
@@ -46,7 +47,7 @@ def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **opti
         LinearityWarning: for linear contacts that the start would open (elongation 1, the initial overlap).
     """
     advance = start(chain, state, method, **options)
-    linearity.warn_if_nonlinear(chain, state, linearity.DEVIATION_WHERE_OPEN, stacklevel=3)
+    amplitude.warn_if_nonlinear(chain, state, amplitude.DEVIATION_WHERE_OPEN, stacklevel=3)
     return advance(checks.times("times", times).to(state.displacement.device))
 
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import Chain
-from torchchain.evolvers import phase
-from torchchain.evolvers.method import Advance, Method, Trajectory
-from torchchain.evolvers.modes import align_modes, modal_amplitudes
-from torchchain.excitation import State
-from torchchain.spectrum import normal_modes
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State, Trajectory
+from torchchain.evolvers.method import Advance, Method
+from torchchain.modes import phase
+from torchchain.modes.motion import align_modes, modal_amplitudes
+from torchchain.modes.spectrum import normal_modes
 
 
 class NearDefectiveWarning(UserWarning):

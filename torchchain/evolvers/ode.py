@@ -25,9 +25,10 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import Chain
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State, Trajectory
 from torchchain.evolvers import drift
-from torchchain.evolvers.method import Advance, Method, Trajectory
+from torchchain.evolvers.method import Advance, Method
 from torchchain.evolvers.symplectic import (
     check_limits,
     damping_rate,
@@ -36,7 +37,6 @@ from torchchain.evolvers.symplectic import (
     largest_overlap,
     substeps,
 )
-from torchchain.excitation import State
 
 ALLOWED_DRIFT = 0.1
 

@@ -36,7 +36,7 @@ import torch
 from numba import njit, types
 from numba.extending import intrinsic
 
-from torchchain.evolvers.chebyshev import LEAP, LONGEST, REACH
+from torchchain.evolvers.expansion import LEAP, LONGEST, REACH
 
 # What a march leaves behind at every output time; the fields are those whose transforms make the energy of a
 # wavenumber. Kinds 3 and up write as many fields as they name.

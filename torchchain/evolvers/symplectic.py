@@ -20,10 +20,10 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import Chain
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State, Trajectory
 from torchchain.evolvers import drift
-from torchchain.evolvers.method import Advance, Trajectory
-from torchchain.excitation import State
+from torchchain.evolvers.method import Advance
 
 Pair = tuple[float, float]
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from torchchain.chain import Chain
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State
 from torchchain.evolvers import symplectic
 from torchchain.evolvers.method import Advance, Method
-from torchchain.excitation import State
 
 # The position extended Forest-Ruth-like algorithm of I. P. Omelyan, I. M. Mryglod and R. Folk, Comput. Phys. Commun.
 # 146 (2002) 188-202. On these chains it is more accurate at equal cost than the other fourth-order compositions tried:

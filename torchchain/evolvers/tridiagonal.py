@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import Chain
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State
 from torchchain.evolvers import modes
 from torchchain.evolvers.method import Advance, Method
-from torchchain.excitation import State
-from torchchain.spectrum import checked_modes
+from torchchain.modes.spectrum import checked_modes
 
 
 def vectors(chain: Chain) -> Tensor:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from torchchain.chain import Chain
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State
 from torchchain.evolvers import symplectic
 from torchchain.evolvers.method import Advance, Method
-from torchchain.excitation import State
 
 VERLET = symplectic.Composition(opening=(0.0, 0.5), middle=(), closing=(1.0, 0.5), limit=2.0, default=0.1)
 

@@ -9,16 +9,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy
+import scipy
 import torch
+import torchdiffeq
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from torchchain import checks
+from torchchain._version import __version__
+from torchchain.ensemble.scene import Scene
 from torchchain.master.fits import checked_window
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import RateModel, SwingInModel, TransferModel
 from torchchain.master.trust import Uncertainty
-from torchchain.scene import Scene
 
 FORMAT = "torchchain-master-equation"
 FAMILY_FORMAT = "torchchain-master-family"
@@ -76,12 +80,6 @@ def save_family(members: Sequence[Member], path: str | Path) -> None:
 
 def _described(model: TransferModel, record: Mapping[str, Any]) -> dict[str, Any]:
     """The header of a model."""
-    import numpy
-    import scipy
-    import torchdiffeq
-
-    from torchchain import __version__
-
     scene: Scene = record["scene"]
     return {
         "format": FORMAT,

@@ -13,7 +13,9 @@ import torch
 from tqdm import tqdm
 
 from torchchain import checks
-from torchchain.ensemble import BandTransfer
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.statistics import total_variation
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import trust
 from torchchain.master.adam import AdamSettings
 from torchchain.master.equation import Calibration, MasterEquation
@@ -21,8 +23,6 @@ from torchchain.master.fits import FitWarning, checked_window, within
 from torchchain.master.ladder import BASES, MODELS, Recipe, Sample, exact_basis, fit
 from torchchain.master.memory import LADDER, checked_order
 from torchchain.master.model import RateModel, TransferModel
-from torchchain.scene import Scene
-from torchchain.statistics import total_variation
 
 LINEAR_WINDOW = (0.5, 2.0)
 NONLINEAR_WINDOW = (0.5, 4.5)

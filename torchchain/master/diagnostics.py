@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.ensemble import BandTransfer
-from torchchain.statistics import jackknife_error, statistical_distance, total_variation
+from torchchain.ensemble.statistics import jackknife_error, statistical_distance, total_variation
+from torchchain.ensemble.transfer import BandTransfer
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from torchchain import checks
-from torchchain.excitation import StandingWave
+from torchchain.chain.excitation import StandingWave
+from torchchain.ensemble.scene import Scene
 from torchchain.master import artifact
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
 from torchchain.master.solvers import SOLVERS, IntegrationError
 from torchchain.master.trust import Uncertainty
-from torchchain.scene import Scene
 from torchchain.threads import single_thread
 
 NEGATIVE_SHARE = 1e-3

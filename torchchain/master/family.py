@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.ensemble import BandTransfer
+from torchchain.ensemble.statistics import total_variation
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import artifact
 from torchchain.master.calibration import calibrate
 from torchchain.master.equation import Calibration, MasterEquation
 from torchchain.master.memory import MemoryModel
 from torchchain.master.trust import Uncertainty
-from torchchain.statistics import total_variation
 
 NEIGHBORS = 4
 

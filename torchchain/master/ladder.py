@@ -22,13 +22,13 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.ensemble import BandTransfer
+from torchchain.energy.wavenumber import basis_fraction
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.adam import AdamSettings, fit_rates
 from torchchain.master.fits import FitWarning, analytic_prefactor, linear_delay, linear_rates, nonlinear_rates, profile
 from torchchain.master.memory import MemoryModel, fit_memory
 from torchchain.master.model import RateModel, SwingInModel, TransferModel
 from torchchain.threads import single_blas_thread, single_thread
-from torchchain.wavenumber import basis_fraction
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.ensemble import BandTransfer
+from torchchain.ensemble.statistics import statistical_distance, total_variation
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import FitWarning
 from torchchain.master.ladder import Recipe, Sample, fit
 from torchchain.master.model import TransferModel
-from torchchain.statistics import statistical_distance, total_variation
 
 MOST_TIMES = 64
 """Times at which the errors of predictions are kept."""

@@ -1,0 +1,75 @@
+"""States of chains: displacement and velocity at one instant, and at many (a trajectory)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Displacement and velocity of every particle at one instant, each (*batch, *any, particle)."""
+
+    displacement: Tensor
+    velocity: Tensor
+
+    def __post_init__(self) -> None:
+        for field in ("displacement", "velocity"):
+            object.__setattr__(self, field, checks.real_tensor(field, getattr(self, field)))
+        if self.displacement.shape != self.velocity.shape:
+            raise checks.fail(
+                "velocity",
+                f"have the displacement's shape {tuple(self.displacement.shape)}",
+                f"shape {tuple(self.velocity.shape)}",
+            )
+        if self.displacement.ndim == 0:
+            raise checks.fail("displacement", "have particles on its last axis", "shape ()")
+
+    def __add__(self, other: State) -> State:
+        """The superposition of two states."""
+        return State(self.displacement + other.displacement, self.velocity + other.velocity)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """States of chains in time.
+
+    Attributes:
+        times: (time,).
+        displacement, velocity: (*batch, *any, time, particle).
+        dissipated: energy lost to contact damping since time 0, (*batch, *any, time); None if undamped.
+        openings: contacts open at any step up to each time, (*batch, *any, time); None for linear contacts.
+    """
+
+    times: Tensor
+    displacement: Tensor
+    velocity: Tensor
+    dissipated: Tensor | None = None
+    openings: Tensor | None = None
+
+    @property
+    def final(self) -> State:
+        """The state at the last time."""
+        return State(self.displacement[..., -1, :], self.velocity[..., -1, :])
+
+
+def join(parts: list[Trajectory]) -> Trajectory:
+    """One trajectory from consecutive windows."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def series(name: str, axis: int) -> Tensor | None:
+        pieces = [getattr(part, name) for part in parts]
+        return None if pieces[0] is None else torch.cat(pieces, dim=axis)
+
+    return Trajectory(
+        torch.cat([part.times for part in parts]),
+        torch.cat([part.displacement for part in parts], dim=-2),
+        torch.cat([part.velocity for part in parts], dim=-2),
+        series("dissipated", -1),
+        series("openings", -1),
+    )

@@ -1,0 +1,5 @@
+"""The command line: flags in, a folder out."""
+
+from torchchain.cli.entry import main
+
+__all__ = ["main"]

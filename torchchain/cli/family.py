@@ -1,0 +1,38 @@
+"""``torchchain family``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import torch
+
+from torchchain import checks
+from torchchain.cli import outputs
+from torchchain.cli.flags import Family
+from torchchain.master import MasterEquation, MasterFamily
+
+
+def run_family(flags: Family, arguments: list[str]) -> None:
+    """Join models of several strengths and leave the family and its record."""
+    began = time.time()
+    if not flags.models:
+        raise checks.fail("models", "be at least one file", "none")
+    out = outputs.check_writable(flags.out)
+    family = MasterFamily([MasterEquation.load(path) for path in flags.models])
+    times = torch.linspace(0, 500, 101, dtype=torch.float64)[1:]
+    left_out = family.leave_one_out(times)
+    outputs.write(
+        out,
+        {
+            "model.safetensors": family.save,
+            "run.json": outputs.run_record(
+                arguments, "", "cpu", began, {}, strengths=list(family.strengths), left_out=left_out,
+                models=[{"path": str(Path(path).resolve()), "sha256": outputs.sha256(path)} for path in flags.models],
+            ),
+        },
+    )  # fmt: skip
+    print(f"disorder 0 to {family.strengths[-1]:g}, calibrated at {', '.join(f'{xi:g}' for xi in family.strengths)}")
+    for strength, distance in left_out:
+        print(f"left out and predicted by the others, 0 < t <= 500: {strength:g}, total variation {distance:.4f}")
+    print(f"results in {out}")

@@ -1,0 +1,168 @@
+"""Energy in space and in wavenumber bands straight from the stencil, without storing the states.
+
+What ``evolve`` with method "chebyshev" and then ``particle_energy``, ``energy_center``, ``energy_width`` or
+``band_energy`` give, for ensembles: each chain stays in cache from the first time to the last and leaves only its
+observables behind. Tensors that the Numba kernels cannot treat go through those functions, a window of times after
+the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State
+from torchchain.energy import space as energy
+from torchchain.energy import wavenumber
+from torchchain.energy.bands import check_bands
+from torchchain.evolvers import start
+from torchchain.evolvers.chebyshev import CompiledAdvance
+from torchchain.evolvers.expansion import ROUNDING
+from torchchain.threads import map_in_order
+
+# Bytes of one field that a thread takes from the stencil through the transform at a time: what it holds stays in cache.
+_BLOCK = 2**18
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyMoments:
+    """Total energy, its center R (Eq. 37) and mean squared width r^2 (Eq. 38), each (*batch, *any, time).
+
+    The sums over particles p of E_p, p E_p and p^2 E_p are total, total * center and total * (width + center^2).
+    """
+
+    total: Tensor
+    center: Tensor
+    width: Tensor
+
+
+def energy_moments(chain: Chain, state: State, times: Any, definition: str = "site", **options: Any) -> EnergyMoments:
+    """Total, center and width of the energy of every output time.
+
+    Args:
+        chain: linear contacts, undamped, masses (*batch, particle).
+        state: the start, (*batch, *any, particle).
+        times: (time,), increasing, not negative; on a uniform grid the work halves.
+        definition: "site" (Eq. 36) or "bond" (Eq. A3), see :func:`torchchain.potential_energy`.
+        options: those of method "chebyshev"; without ``accuracy``, it is that of rounding.
+
+    Returns:
+        EnergyMoments, dtype and device of the state.
+
+    Raises:
+        FieldError: as ``evolve`` and ``energy_center`` do.
+    """
+    checks.choice("definition", definition, energy.DEFINITIONS)
+    times = checks.times("times", times)
+    advance = start(chain, state, "chebyshev", **{"accuracy": ROUNDING, **options})
+    shape = (*state.displacement.shape[:-1], len(times))
+    if not isinstance(advance, CompiledAdvance):
+        parts = []
+        for window in _windows(times, state):
+            here = energy.particle_energy(chain, advance(window), definition)
+            parts.append(torch.stack([here.sum(-1), energy.energy_center(here), energy.energy_width(here)]))
+        return EnergyMoments(*torch.cat(parts, dim=-1))
+    from torchchain.evolvers import stencil
+
+    kind = stencil.SITE_MOMENTS if definition == "site" else stencil.BOND_MOMENTS
+    advance.check_work(times)
+    march, steps = stencil.March(advance.rows, mirrored=True, once=True), times.double().numpy()
+    out = np.empty((advance.rows.count, len(steps), 3))
+    stencil.share(lambda begin, end: march.moments(begin, end, steps, kind, out), advance.rows.count)
+    moments = torch.from_numpy(out).to(state.displacement.dtype)
+    total, center, width = moments.reshape(*shape, 3).unbind(-1)
+    if not (out[..., 0] > 0).all():
+        checks.first_bad("total energy", "be positive", total, ~(total > 0), "time")
+    return EnergyMoments(total, center, width)
+
+
+def band_energy(
+    chain: Chain,
+    state: State,
+    times: Any,
+    n_bands: int = 32,
+    normalize: bool = True,
+    definition: str = "site",
+    **options: Any,
+) -> Tensor:
+    """Energy in each wavenumber band at every output time (Eqs. 44-46).
+
+    Args:
+        chain: linear contacts, undamped, an even number of particles, masses (*batch, particle).
+        state: the start, (*batch, *any, particle), for instance an axis of tones.
+        times: (time,), increasing, not negative; on a uniform grid the work halves.
+        n_bands, normalize, definition: as in :func:`torchchain.band_energy`.
+        options: those of method "chebyshev"; without ``accuracy``, it is that of rounding.
+
+    Returns:
+        (*batch, *any, time, band), dtype and device of the state.
+
+    Raises:
+        FieldError: as ``evolve`` and ``band_energy`` do.
+    """
+    checks.choice("definition", definition, energy.DEFINITIONS)
+    check_bands(chain.n_particles, n_bands)
+    times = checks.times("times", times)
+    advance = start(chain, state, "chebyshev", **{"accuracy": ROUNDING, **options})
+    if definition == "bond" and chain.boundary != "periodic":
+        raise checks.fail("boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary))
+    if not isinstance(advance, CompiledAdvance):
+        return torch.cat(
+            [
+                wavenumber.band_energy(chain, advance(window), n_bands, normalize, definition)
+                for window in _windows(times, state)
+            ],
+            dim=-2,
+        )
+    from torchchain.evolvers import stencil
+
+    advance.check_work(times)
+    n, steps, rows = chain.n_particles, times.double().numpy(), advance.rows
+    kind, count = stencil.BOND_FIELDS, 2
+    strain = np.zeros(n // 2 + 1)
+    if definition == "site":
+        kind, count = (stencil.UNIFORM_FIELDS, 3) if chain.is_uniform_ring else (stencil.SITE_FIELDS, 4)
+        strain += rows.contacts[0, 0] * 4 * np.sin(math.pi / n * np.arange(n // 2 + 1)) ** 2
+    window = min(len(steps), max(1, _BLOCK // (8 * n)))
+    size = min(rows.count, max(1, _BLOCK // (8 * n * window)))
+    strain = np.repeat(strain, 2)  # of the real and of the imaginary part
+    march = stencil.March(rows, mirrored=True, once=window == len(steps))
+    bands, totals = np.empty((rows.count, len(steps), n_bands)), np.empty((rows.count, len(steps)))
+
+    def work(part: tuple[int, int]) -> None:
+        # Little Python a block: a thread that waits for another's is slow to wake.
+        begin, end = part
+        fields = torch.empty((count, 0, 0, n), dtype=torch.float64)
+        for low in range(begin, end, size):
+            high = min(low + size, end)
+            for first in range(0, len(steps), window):
+                last = min(first + window, len(steps))
+                if fields.shape[1:3] != (high - low, last - first):
+                    fields = torch.empty((count, high - low, last - first, n), dtype=torch.float64)
+                march.fields(low, high, steps[first:last], kind, fields.numpy(), low)
+                spectra = torch.fft.rfft(fields).numpy().view(np.float64)
+                stencil.bin_spectra(spectra, kind, strain, normalize, low, first, bands, totals)
+                del spectra  # so that the next lie where these do, in cache
+
+    workers = min(torch.get_num_threads(), rows.count)
+    for _ in map_in_order(work, stencil.ranges(rows.count, workers), workers):
+        pass
+    shape = (*state.displacement.shape[:-1], len(steps))
+    if normalize and not (totals > 0).all():
+        total = torch.from_numpy(totals).reshape(shape)
+        checks.first_bad("total energy", "be positive to normalize", total, ~(total > 0), "time")
+    return torch.from_numpy(bands).reshape(*shape, n_bands).to(state.displacement.dtype)
+
+
+def _windows(times: Tensor, state: State) -> Iterator[Tensor]:
+    """Windows of times whose states fit in some 100 MB."""
+    size = max(1, 2**23 // state.displacement.numel())
+    yield from times.to(state.displacement.device).split(size)

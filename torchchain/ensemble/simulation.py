@@ -1,0 +1,86 @@
+"""Ensemble means of the observables of a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import xarray
+from torch import Tensor
+
+from torchchain.ensemble import plan as planning
+from torchchain.ensemble.checkpoint import Checkpoint
+from torchchain.ensemble.chunk import Chunk
+from torchchain.ensemble.labels import coordinates, ordered_error, scene_attributes
+from torchchain.ensemble.observables import IN_TIME
+from torchchain.ensemble.ranks import ALONE, Ranks
+from torchchain.ensemble.run import ensemble_moments
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.stages import Stages
+from torchchain.ensemble.statistics import Moments, merged
+from torchchain.threads import single_thread
+
+
+def simulate(
+    scene: Scene,
+    method: str = "auto",
+    *,
+    device: str | torch.device = "cpu",
+    memory_budget: int | None = None,
+    progress: bool = False,
+    stages: Stages | None = None,
+    options: dict[str, Any] | None = None,
+    checkpoint: Checkpoint | str | Path | None = None,
+    ranks: Ranks = ALONE,
+) -> xarray.Dataset:
+    """Ensemble means of the scene's observables and their standard errors.
+
+    Args:
+        scene: what is wanted; its ``observables`` name the variables.
+        method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
+        device, memory_budget, progress, stages, options: see :func:`stream`.
+        checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
+        ranks: processes that share the realizations, from :func:`torchchain.ranks.process_group`; each gets the result.
+
+    Returns:
+        Dataset with a variable and its ``_stderr`` for every observable, axes ([tone,] time, particle | wavenumber |
+        band), coordinates counted from 1, units in the attributes; realized mass moments in the attributes.
+        A single realization of a disordered chain has the standard error infinity.
+    """
+    scene, stages = planning.resolved(scene), stages or Stages()
+    in_time = [name for name in scene.observables if name in IN_TIME]
+
+    def measure(chunk: Chunk) -> dict[str, Tensor]:
+        measured = chunk.observe(in_time)
+        if "long_time_band_energy" in scene.observables:
+            measured["long_time_band_energy"] = chunk.long_time()
+        return measured
+
+    ensemble = ensemble_moments(
+        scene, measure, method, names=scene.observables, device=device, memory_budget=memory_budget, progress=progress,
+        stages=stages, options=options, checkpoint=checkpoint, ranks=ranks,
+    )  # fmt: skip
+    with single_thread():
+        found = {name: merged(ensemble.moments.blocks(name)) for name in scene.observables}
+        return _dataset(scene, found, ensemble.attributes)
+
+
+def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, Any]) -> xarray.Dataset:
+    leading = ("tone",) if scene.tones else ()
+    variables: dict[str, Any] = {}
+    used: set[str] = set()
+    for name, moment in moments.items():
+        entry = IN_TIME.get(name)
+        axes = leading + (entry.axes if entry else ("band",))
+        used.update(axes)
+        notes = {
+            "units": entry.unit if entry else "1",
+            "long_name": entry.long_name if entry else "infinite-time average of the share of the energy in a band",
+        }
+        variables[name] = (axes, moment.mean.numpy(), notes)
+        error = ordered_error(scene, moment)
+        variables[f"{name}_stderr"] = (
+            axes, error.numpy(), {**notes, "long_name": f"standard error of {notes['long_name']}"},
+        )  # fmt: skip
+    return xarray.Dataset(variables, coords=coordinates(scene, used), attrs=scene_attributes(scene) | attributes)

@@ -1,0 +1,28 @@
+"""Seconds spent in the stages of a run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class Stages:
+    """Seconds spent in each named stage of a run; work on several threads counts its share of the time."""
+
+    def __init__(self, share: float = 1.0) -> None:
+        self.share = share
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.add({name: self.share * (time.perf_counter() - begin)})
+
+    def add(self, seconds: dict[str, float]) -> None:
+        """Take in the seconds of other stages."""
+        for name, value in seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + value

@@ -1,0 +1,110 @@
+"""Whether a calibrated master equation can take the place of the chains of a scene, and how far off it is then."""
+
+from __future__ import annotations
+
+import math
+import time
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain.excitation import StandingWave
+from torchchain.energy.bands import band_of
+from torchchain.ensemble import plan as planning
+from torchchain.ensemble.machine import Machine
+from torchchain.ensemble.plan import ARTIFACT, Choice, Plan, statistical_error
+from torchchain.ensemble.scene import Scene
+from torchchain.master.equation import MasterEquation
+
+PREDICTED = frozenset({"band_energy", "long_time_band_energy"})
+TIMED = 64  # times of the trial solution
+
+
+def gaps(master: MasterEquation, scene: Scene) -> list[str]:
+    """What the scene asks for beyond the calibration, in words; empty where the calibration covers it."""
+    found = master.concerns(scene)
+    other = [name for name in scene.observables if name not in PREDICTED]
+    if other:
+        found.append(f"{', '.join(other)}, where it predicts energies of bands")
+    if not isinstance(scene.excitation, StandingWave):
+        found.append("an impulse, calibrated on standing waves")
+    return found
+
+
+def starts(master: MasterEquation, scene: Scene) -> Tensor:
+    """A unit energy in the band of each tone, (tone, band)."""
+    bands = [band_of(tone, scene.n_particles, scene.n_bands) - 1 for tone in scene.tones]
+    return torch.eye(master.n_bands, dtype=torch.float64)[bands]
+
+
+def error(master: MasterEquation, scene: Scene) -> float | None:
+    """Largest standard error of the predicted shares of the energy, or None where the calibration does not tell.
+
+    Without a bootstrap the fit's own test on held-out realizations has to do. Half of the calibrating ensemble was
+    predicted from the other half, at the distance h in total variation, two halves being d apart: h^2 - d^2 is the
+    model's own error, squared, and the noise of the whole ensemble is d / 2.
+    """
+    if master.uncertainty is not None:
+        return float(master.standard_error(starts(master, scene), scene.times).max())
+    held, halves = (master.calibration.report.get(name) for name in ("held_out_distance", "halves_distance"))
+    if not isinstance(held, float) or not isinstance(halves, float):
+        return None
+    return math.sqrt(max(0.0, held**2 - halves**2) + halves**2 / 4)
+
+
+def seconds(master: MasterEquation, scene: Scene) -> float:
+    """Time of a prediction, from a trial solution of up to 64 of its times after one that does not count."""
+    rows, some = starts(master, scene), scene.times[-TIMED:]
+    spent = 0.0
+    for _ in range(2):
+        begin = time.perf_counter()
+        master.solve(rows, some)
+        spent = time.perf_counter() - begin
+    return spent * len(scene.times) / len(some)
+
+
+def plan(scene: Scene, machine: Machine | None = None, artifact: str | Path | MasterEquation | None = None) -> Plan:
+    """The cheapest way to a scene whose predicted error is within its tolerance.
+
+    Without a tolerance the method's error may be a third of the statistical error of the ensemble, to which it adds
+    5 %: a finer integrator would be waste. Errors come from each method's own theory, times from counted work and the
+    speeds of the machine.
+
+    Args:
+        scene: what is wanted.
+        machine: speeds; None for this machine's own.
+        artifact: a calibrated master equation, or the file of one, that could take the place of the chains.
+
+    Returns:
+        Plan, whose ``str`` is the table that ``torchchain plan`` prints.
+
+    Raises:
+        FieldError: if no method can treat the scene, or none reaches the tolerance.
+    """
+    return planning.plan(scene, machine, None if artifact is None else partial(_stand_in, artifact=artifact))
+
+
+def _stand_in(scene: Scene, tolerance: float, artifact: str | Path | MasterEquation) -> tuple[list[Choice], list[str]]:
+    """A prediction in place of the chains, if the calibration covers the scene, and what is to be said of it.
+
+    Its error holds the noise of its own ensemble, which takes the place of the scene's: without a tolerance it may be
+    as large as that.
+    """
+    checks.instance("artifact", artifact, str, Path, MasterEquation)
+    master = artifact if isinstance(artifact, MasterEquation) else MasterEquation.load(artifact)
+    missing = gaps(master, scene)
+    if missing:
+        return [], [f"the master equation at hand does not cover the scene: {'; '.join(missing)}"]
+    expected = error(master, scene)
+    if expected is None:
+        return [], ["the master equation at hand covers the scene, but its calibration does not tell its error"]
+    allowed = tolerance if scene.tolerance is not None else statistical_error(scene)
+    choice = Choice(ARTIFACT, {}, expected, seconds(master, scene), allowed)
+    verdict = "accurate enough" if choice.good else "not accurate enough"
+    return [choice], [
+        f"the master equation at hand covers the scene and is {verdict}: its shares of the energy are good to "
+        f"{expected:.1e}, {allowed:.1e} allowed"
+    ]
