@@ -24,7 +24,7 @@ from torch import Tensor
 
 import torchchain as tc
 from torchchain import checks
-from torchchain.bands import center_tones
+from torchchain.energy.bands import center_tones
 from torchchain.frames import Frames, FramesWarning, read_frames
 
 LAWS = ("linear", "hertz")

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import Chain
-from torchchain.evolvers.method import Trajectory
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import Trajectory
 from torchchain.frames.record import AXES, Box, Contacts, Frame, FramesWarning
 
 LAWS = ("linear", "hertz")

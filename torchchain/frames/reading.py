@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import Chain
-from torchchain.evolvers.method import Trajectory
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import Trajectory
 from torchchain.frames import lammps, lammps_local, liggghts_local, mercury, mercury_fstat, motion, netcdf, xyz
 from torchchain.frames.motion import ContactUnits, here, warn
 from torchchain.frames.record import AXES, Box, Contacts, Frame
