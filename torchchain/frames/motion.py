@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import sys
 import warnings
 from collections.abc import Iterable
@@ -17,6 +16,7 @@ from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
 from torchchain.frames.record import AXES, Box, Contacts, Frame, FramesWarning
+from torchchain.memory import gigabytes, memory
 
 LAWS = ("linear", "hertz")
 DRIFT = 0.01  # share of the energy that an undamped run may gain or lose before a warning
@@ -127,11 +127,12 @@ def displacements(
     if line is not None:
         check_contact_order(name, first, order, line)
     size = 16 * n_frames * len(order) * len(columns)
-    if size > _memory():
+    limit = memory(torch.device("cpu"))
+    if size > limit:
         raise checks.fail(
             f"{name}: frames",
-            f"fit into the memory of {_memory() / 1e9:.0f} GB (take fewer, as in frames[::10])",
-            f"{size / 1e9:.1f} GB of displacements and velocities",
+            f"fit into the {gigabytes(limit)} of memory of this machine (take fewer, as in frames[::10])",
+            f"{gigabytes(size)} of displacements and velocities",
         )
     shape = (n_frames, len(order), len(columns))
     moved, velocity = torch.empty(shape, dtype=torch.float64), torch.empty(shape, dtype=torch.float64)
@@ -172,10 +173,6 @@ def displacements(
         _check_across(name, last, line)
         moved, velocity = moved[..., 0], velocity[..., 0]
     return Trajectory(times - times[0], moved, velocity)
-
-
-def _memory() -> int:
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _period(box: Box | None, axis: str) -> float:
