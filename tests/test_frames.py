@@ -163,6 +163,17 @@ def test_lammps_makes_the_stored_dumps_again(tmp_path):
             assert (old.positions - new.positions).abs().max() < 1e-10
 
 
+def test_a_master_equation_from_imported_energies_is_as_good_as_the_ensemble():
+    """Energies by the library stand for dumps; the second half of the chains is not seen by the fit."""
+    config = replace(lammps_chains.Config(), n_particles=32, n_bands=4, realizations=40)
+    ours = lammps_chains.chains(config, "linear", 40)
+    state, times = lammps_chains.start(config, "linear", ours), torch.arange(0, 20, 0.5, dtype=torch.float64)
+    energies = tc.band_energy(ours, tc.evolve(ours, state, times), n_bands=4)
+    late = tc.long_time_band_energy(ours, state, n_bands=4)
+    found = lammps_chains.scored(config.scene(config.strength), times, energies, late)
+    assert 0 < found["master_distance"] < 1.25 * found["halves_distance"]
+
+
 # Every way to write a dump
 
 
