@@ -1,9 +1,11 @@
 """Trajectories of other codes: LAMMPS, LIGGGHTS, MercuryDPM, extended XYZ."""
 
-from torchchain.frames.motion import ContactUnits, check_energy
-from torchchain.frames.reading import FORMATS, Frames, convert, read_frames
+from torchchain.frames.doubts import check_energy
+from torchchain.frames.formats import FORMATS
+from torchchain.frames.reading import Frames, convert, read_frames
 from torchchain.frames.record import Box, Contacts, Frame, FramesWarning
 from torchchain.frames.registry import Format
+from torchchain.frames.units import ContactUnits
 
 __all__ = [
     "FORMATS",

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import glob
-import math
 import os
-import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -19,40 +16,15 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
-from torchchain.frames import lammps, lammps_local, liggghts_local, mercury, mercury_fstat, motion, netcdf, xyz
-from torchchain.frames.motion import ContactUnits, here, warn
-from torchchain.frames.record import AXES, Box, Contacts, Frame
-from torchchain.frames.registry import Entry, Format, Raw
-from torchchain.frames.text import Text, readable
-
-FORMATS: dict[str, Format] = {
-    entry.name: entry
-    for entry in (
-        lammps.FORMAT, mercury.FORMAT, xyz.FORMAT, netcdf.FORMAT, liggghts_local.FORMAT, lammps_local.FORMAT, mercury_fstat.FORMAT,
-    )
-}  # fmt: skip
-HEAD = 1 << 14
-OPTIONS = ("time_step", "masses", "density", "contact_columns", "periodic")
-Source = str | os.PathLike[str]
-
-
-@dataclass(frozen=True)
-class _File:
-    """A file and its format."""
-
-    path: Path
-    format: Format
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where a frame and its contacts are."""
-
-    number: int
-    file: _File
-    entry: Entry
-    contact_file: _File | None = None
-    contact_entry: Entry | None = None
+from torchchain.frames import netcdf
+from torchchain.frames.building import build, kept, own_contacts
+from torchchain.frames.chains import chain as make_chain
+from torchchain.frames.doubts import check_energy, here
+from torchchain.frames.motion import displacements
+from torchchain.frames.opening import File, Place, Source, find, time_of
+from torchchain.frames.record import Box, Contacts, Frame
+from torchchain.frames.registry import Entry, Raw
+from torchchain.frames.units import ContactUnits, fit_units, scaled_contacts
 
 
 def read_frames(
@@ -90,148 +62,7 @@ def read_frames(
         >>> frames = read_frames("run.dump")  # doctest: +SKIP
         >>> chain, path = frames.chain(boundary="periodic"), frames.trajectory()  # doctest: +SKIP
     """
-    checks.known_keys("options", options, OPTIONS)
-    options = _check_options(options)
-    if format is not None:
-        checks.choice("format", format, [name for name, known in FORMATS.items() if known.holds == "particles"])
-    places: list[_Place] = []
-    cut, units, files = [], None, _files("path", path)
-    for file in files:
-        found = _known(file, "particles", format)
-        scan = found.format.scan(file, options)
-        places += [_Place(len(places) + 1 + i, found, entry) for i, entry in enumerate(scan.entries)]
-        units = units or scan.units
-        if scan.cut:
-            if file is not files[-1] or not places:
-                raise checks.fail(scan.cut.partition(":")[0], "be whole", scan.cut.partition(": ")[2])
-            cut.append(scan.cut)
-    if not places:
-        raise checks.fail(files[0].name, "hold at least one frame", "none")
-    _check_times(places, options)
-    for words in cut:
-        warn(words.partition(":")[0], words.partition(": ")[2] + ": left out")
-    if contacts is not None:
-        places = _with_contacts(places, _files("contacts", contacts), options)
-    return Frames(tuple(places), options, units)
-
-
-def _check_options(options: dict[str, Any]) -> dict[str, Any]:
-    if options.get("time_step") is not None:
-        options["time_step"] = checks.number("time_step", options["time_step"], above=0.0)
-    if options.get("density") is not None:
-        options["density"] = checks.number("density", options["density"], above=0.0)
-        if options.get("masses") is not None:
-            raise checks.fail("density", "not be given together with masses", options["density"])
-    periodic = options.get("periodic")
-    if periodic is not None and (not isinstance(periodic, str) or not set(periodic) <= set(AXES)):
-        raise checks.fail("periodic", "be axes such as 'x' or 'xy'", periodic)
-    return options
-
-
-def _files(field: str, path: Source | Sequence[Source]) -> list[Path]:
-    """The files of a path, a pattern, or a list; those of a pattern in the order of the numbers in their names."""
-    if isinstance(path, (str, os.PathLike)):
-        text = os.fspath(path)
-        if isinstance(text, str) and not os.path.exists(text) and glob.has_magic(text):
-            found = sorted(
-                glob.glob(text),
-                key=lambda name: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)],
-            )
-            if not found:
-                raise checks.fail(field, "match at least one file", repr(text))
-            return [readable(field, Path(name)) for name in found]
-        return [readable(field, Path(os.fsdecode(text)))]
-    if not isinstance(path, Sequence) or not path:
-        raise checks.FieldTypeError(f"{field} must be a path, a pattern or a list of paths, got {checks.shown(path)}")
-    return [file for part in path for file in _files(field, part)]
-
-
-def _known(path: Path, holds: str, name: str | None = None) -> _File:
-    """The file with its format: as named, or as it begins."""
-    if name is not None:
-        return _File(path, FORMATS[name])
-    with open(path, "rb") as file:
-        head = file.read(HEAD)
-    if head[:2] == b"\x1f\x8b":
-        head = _head(path)
-    for known in FORMATS.values():
-        if known.holds == holds and known.recognizes(head):
-            return _File(path, known)
-    other = next((known.name for known in FORMATS.values() if known.recognizes(head)), None)
-    names = ", ".join(known.name for known in FORMATS.values() if known.holds == holds)
-    raise checks.fail(
-        path.name,
-        f"be a file of {holds} ({names})",
-        f"one of {other}" if other else f"one that begins with {checks.shown(head[:24].decode('latin-1'))}",
-    )
-
-
-def _head(path: Path) -> bytes:
-    with Text(path) as text:
-        return text.head(HEAD)
-
-
-def _time(entry: Entry, options: dict[str, Any]) -> float | None:
-    if entry.time is not None:
-        return entry.time
-    step = options.get("time_step")
-    return None if step is None or entry.step is None else entry.step * step
-
-
-def _check_times(places: list[_Place], options: dict[str, Any]) -> None:
-    """An error for frames out of order."""
-    before: _Place | None = None
-    for place in places:
-        if before is not None:
-            for field in ("step", "time"):
-                a, b = getattr(before.entry, field), getattr(place.entry, field)
-                if (a is None) != (b is None):
-                    raise checks.fail(
-                        f"{place.file.path.name}, frame {place.entry.number}: {field}",
-                        "be given in all frames or in none",
-                        b,
-                    )
-                if a is not None and b <= a:
-                    raise checks.fail(
-                        f"{place.file.path.name}, frame {place.entry.number}: {field}",
-                        "be later than in the frame before",
-                        f"{b:.10g} after {a:.10g}",
-                    )
-        before = place
-    if options.get("time_step") is not None and places[0].entry.time is not None:
-        raise checks.fail(
-            "time_step", f"be left out, as {places[0].file.path.name} states its times", options["time_step"]
-        )
-
-
-def _with_contacts(places: list[_Place], files: list[Path], options: dict[str, Any]) -> list[_Place]:
-    """The places of the frames, each with that of its contacts if there are any."""
-    by: dict[Any, tuple[_File, Entry]] = {}
-    kind = "step"
-    for path in files:
-        file = _known(path, "contacts")
-        kind = file.format.match
-        scan = file.format.scan(path, options)
-        if scan.cut:
-            warn(scan.cut.partition(":")[0], scan.cut.partition(": ")[2] + ": left out")
-        for entry in scan.entries:
-            key = getattr(entry, kind)
-            if key in by:
-                raise checks.fail(f"{path.name}, frame {entry.number}: {kind}", "be another than before", key)
-            by[key] = (file, entry)
-    if getattr(places[0].entry, kind) is None:
-        raise checks.fail(
-            f"{places[0].file.path.name}: {kind}", f"be in the file to find the contacts in {files[0].name}", "none"
-        )
-    found = [by.get(getattr(place.entry, kind)) for place in places]
-    if not any(found):
-        raise checks.fail(
-            f"{files[0].name}: {kind}", f"be that of a frame of {places[0].file.path.name}", checks.shown(list(by)[:3])
-        )
-    return [
-        replace(place, contact_file=one[0], contact_entry=one[1]) if one else place
-        for place, one in zip(places, found, strict=True)
-    ]
+    return Frames(*find(path, contacts, format, options))
 
 
 class Frames:
@@ -243,7 +74,7 @@ class Frames:
 
     def __init__(
         self,
-        places: tuple[_Place, ...],
+        places: tuple[Place, ...],
         options: dict[str, Any],
         file_units: str | None = None,
         scale: Any = None,
@@ -300,7 +131,7 @@ class Frames:
         Raises:
             FieldError: where the file has only step numbers and no time step was given.
         """
-        times = [_time(place.entry, self._options) for place in self._places]
+        times = [time_of(place.entry, self._options) for place in self._places]
         if any(time is None for time in times):
             raise checks.fail(
                 f"{self.name}: TIME",
@@ -393,7 +224,7 @@ class Frames:
             reference: the state at rest; by default the first frame.
         """
         frame = reference[0] if isinstance(reference, Frames) else (reference or self.first)
-        return motion.fit_units(self.name, frame, law)
+        return fit_units(self.name, frame, law)
 
     # Chains
 
@@ -420,7 +251,7 @@ class Frames:
         Warns:
             FramesWarning: for a mean mass far from 1, and a box that is not periodic where the chain is.
         """
-        return motion.chain(self.name, self.first, boundary, stiffness, axis, contact, damping)
+        return make_chain(self.name, self.first, boundary, stiffness, axis, contact, damping)
 
     def trajectory(
         self, reference: Source | Frames | Frame | None = None, *, axis: str | None = None, chain: Chain | None = None
@@ -444,7 +275,7 @@ class Frames:
             FramesWarning: for displacements above the overlap, positions of too few digits, and motion across the chain.
         """
         at_rest, name = self._reference(reference)
-        found = motion.displacements(self.name, self, len(self), self.first, at_rest, name, axis, self._unit("length"))
+        found = displacements(self.name, self, len(self), self.first, at_rest, name, axis, self._unit("length"))
         if chain is not None:
             checks.instance("chain", chain, Chain)
             if found.displacement.ndim != 2 or chain.masses.shape != found.displacement.shape[-1:]:
@@ -453,7 +284,7 @@ class Frames:
                     f"have masses of shape {tuple(found.displacement.shape[1:])}",
                     f"shape {tuple(chain.masses.shape)}",
                 )
-            motion.check_energy(self.name, chain, found)
+            check_energy(self.name, chain, found)
         return found
 
     def _reference(self, reference: Source | Frames | Frame | None) -> tuple[Frame, str]:
@@ -463,7 +294,7 @@ class Frames:
             return reference, "reference"
         if not isinstance(reference, Frames):
             options = {name: value for name, value in self._options.items() if name == "periodic"}  # only where it is
-            reference = Frames(read_frames(reference, **options)._places, options, None, self._scale, self._keep)
+            reference = Frames(*find(reference, None, None, options), self._scale, self._keep)
         if len(reference) != 1:
             raise checks.fail(
                 f"{reference.name}: frames", "be one for a reference (choose it: read_frames(path)[-1])", len(reference)
@@ -476,14 +307,14 @@ class Frames:
         return 1.0 if self._scale is None else float(self._scale.unit(quantity))
 
     def _read_first(self) -> Frame:
-        return self._build(self._places[0], next(self._raws(self._places[:1])), None, None)
+        return build(self._places[0], next(self._raws(self._places[:1])), None, None, self._options)
 
-    def _raws(self, places: Iterable[_Place]) -> Iterator[Raw]:
+    def _raws(self, places: Iterable[Place]) -> Iterator[Raw]:
         """The frames as their files have them; each file is opened once for consecutive frames."""
         for file, group in _groups([(place.file, place.entry) for place in places]):
             yield from file.format.read(file.path, group, self._options)
 
-    def _frames(self, places: Sequence[_Place]) -> Iterator[Frame]:
+    def _frames(self, places: Sequence[Place]) -> Iterator[Frame]:
         listed = [
             (place.contact_file, place.contact_entry) for place in places if place.contact_file and place.contact_entry
         ]
@@ -497,86 +328,14 @@ class Frames:
             )
         for place, raw in zip(places, self._raws(places), strict=True):
             joined = next(contacts) if place.contact_entry is not None else None
-            yield self._view(self._build(place, raw, joined, self._origin), next(own, None))
-
-    def _build(self, place: _Place, raw: Raw, contacts: Raw | None, first: Frame | None) -> Frame:
-        """A frame from its numbers: in the order of the ids, checked against the first."""
-        at = f"{place.file.path.name}, frame {place.entry.number}"
-        columns = raw.columns
-        if "id" not in columns:
-            raise checks.fail(
-                f"{at}: id", "be in the file, as rows come in any order", f"columns {', '.join(columns) or 'of no use'}"
-            )
-        ids = columns["id"]
-        if not len(ids):
-            raise checks.fail(f"{at}: particles", "be at least one", 0)
-        order = np.argsort(ids, kind="stable")
-        ids = ids[order]
-        if len(ids) > 1 and (np.diff(ids) == 0).any():
-            raise checks.fail(f"{at}: id", "be there once", int(ids[:-1][np.diff(ids) == 0][0]))
-        axes = tuple(axis for axis in AXES if axis in columns)
-        if not axes:
-            raise checks.fail(f"{at}: positions", "be in the file (x, xu, xs or xsu)", f"columns {', '.join(columns)}")
-        moving = all(f"v{axis}" in columns for axis in axes)
-
-        def column(name: str) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(columns[name][order], dtype=np.float64))
-
-        for name in ("mass", "radius"):
-            if name in columns and (columns[name] <= 0 if name == "mass" else columns[name] < 0).any():
-                bad = int(np.argmin(columns[name]))
-                raise checks.fail(
-                    f"{at}: {name}",
-                    "be positive" if name == "mass" else "not be negative",
-                    f"{columns[name][bad]:g} of id {int(columns['id'][bad])}",
-                )
-        frame = Frame(
-            number=place.number,
-            step=place.entry.step,
-            time=_time(place.entry, self._options),
-            ids=torch.from_numpy(np.ascontiguousarray(ids, dtype=np.int64)),
-            axes=axes,
-            positions=torch.stack([column(axis) for axis in axes], -1),
-            unwrapped=tuple(axis in raw.unwrapped for axis in axes),
-            velocities=torch.stack([column(f"v{axis}") for axis in axes], -1) if moving else None,
-            masses=column("mass") if "mass" in columns else None,
-            radii=column("radius") if "radius" in columns else None,
-            box=self._marked(raw.box),
-        )
-        if first is None:
-            types = columns["type"][order] if "type" in columns else None
-            return replace(frame, **_masses(at, frame, types, place.file, self._options))
-        _check_same(at, frame, first)
-        frame = replace(
-            frame, ids=first.ids, masses=first.masses, radii=first.radii if frame.radii is None else frame.radii
-        )
-        if contacts is not None:
-            assert place.contact_file is not None
-            assert place.contact_entry is not None
-            frame = replace(
-                frame,
-                contacts=_contacts(
-                    f"{place.contact_file.path.name}, frame {place.contact_entry.number}",
-                    contacts.columns,
-                    frame,
-                    place.file.path.name,
-                ),
-            )
-        return frame
-
-    def _marked(self, box: Box | None) -> Box | None:
-        marks = self._options.get("periodic")
-        if box is None or not marks:
-            return box
-        x, y, z = (flag or axis in marks for axis, flag in zip(AXES, box.periodic, strict=True))
-        return replace(box, periodic=(x, y, z))
+            yield self._view(build(place, raw, joined, self._origin, self._options), next(own, None))
 
     def _view(self, frame: Frame, own: dict[str, np.ndarray] | None) -> Frame:
         """The frame as this view shows it: its particles, its units."""
         if own is not None:
-            frame = replace(frame, contacts=_own_contacts(f"{self.name}, frame {frame.number}", own, len(frame.ids)))
+            frame = replace(frame, contacts=own_contacts(f"{self.name}, frame {frame.number}", own, len(frame.ids)))
         if self._keep is not None:
-            frame = _kept(frame, torch.searchsorted(frame.ids, self._keep))
+            frame = kept(frame, torch.searchsorted(frame.ids, self._keep))
         if self._scale is None:
             return frame
         length, time, mass = self._unit("length"), self._unit("time"), self._unit("mass")
@@ -592,169 +351,17 @@ class Frames:
             masses=None if frame.masses is None else frame.masses / mass,
             radii=None if frame.radii is None else frame.radii / length,
             box=box,
-            contacts=motion.scaled_contacts(frame.contacts, length, self._unit("force")),
+            contacts=scaled_contacts(frame.contacts, length, self._unit("force")),
         )
 
 
-def _groups(pairs: Sequence[tuple[Any, Any]]) -> Iterator[tuple[_File, list[Entry]]]:
+def _groups(pairs: Sequence[tuple[Any, Any]]) -> Iterator[tuple[File, list[Entry]]]:
     """Consecutive entries of one file together."""
     begin = 0
     for i in range(1, len(pairs) + 1):
         if i == len(pairs) or pairs[i][0] is not pairs[begin][0]:
             yield pairs[begin][0], [entry for _, entry in pairs[begin:i]]
             begin = i
-
-
-def _kept(frame: Frame, places: Tensor) -> Frame:
-    """The particles at these places, and the contacts between them."""
-    contacts = frame.contacts
-    if contacts is not None:
-        moved = torch.full((len(frame.ids) + 1,), -2, dtype=torch.int64)  # the last is that of -1, a wall
-        moved[places] = torch.arange(len(places))
-        moved[-1] = -1
-        pairs = moved[contacts.pairs]
-        # A contact with a particle that is left out is one with a wall.
-        inside = (pairs >= 0).any(-1)
-        pairs = pairs[inside].clamp(min=-1)
-        contacts = Contacts(
-            pairs, *(None if v is None else v[inside] for v in (contacts.overlap, contacts.normal_force))
-        )
-
-    def part(values: Tensor | None) -> Tensor | None:
-        return None if values is None else values[places]
-
-    return replace(
-        frame,
-        ids=frame.ids[places],
-        positions=frame.positions[places],
-        velocities=part(frame.velocities),
-        masses=part(frame.masses),
-        radii=part(frame.radii),
-        contacts=contacts,
-    )
-
-
-def _check_same(at: str, frame: Frame, first: Frame) -> None:
-    """An error for a frame with other particles, columns or properties than the first."""
-    if not torch.equal(frame.ids, first.ids):
-        missing, new = first.ids[~torch.isin(first.ids, frame.ids)], frame.ids[~torch.isin(frame.ids, first.ids)]
-        words = [
-            f"{len(part)} {word} (id {int(part[0])}{', ...' if len(part) > 1 else ''})"
-            for word, part in (("missing", missing), ("new", new))
-            if len(part)
-        ]
-        raise checks.fail(
-            f"{at}: id", f"be those of the {len(first.ids)} particles of the first frame", " and ".join(words)
-        )
-    if frame.axes != first.axes or frame.unwrapped != first.unwrapped:
-        raise checks.fail(f"{at}: positions", "be as in the first frame", ", ".join(frame.axes))
-    for name in ("masses", "radii"):
-        a, b = getattr(frame, name), getattr(first, name)
-        if a is not None and b is not None and not torch.equal(a, b):
-            bad = int((a != b).nonzero()[0])
-            raise checks.fail(
-                f"{at}: {name}",
-                "stay as in the first frame (have particles come or gone?)",
-                f"{a[bad]:g} after {b[bad]:g} of id {int(first.ids[bad])}",
-            )
-
-
-def _masses(at: str, frame: Frame, types: np.ndarray | None, file: _File, options: dict[str, Any]) -> dict[str, Any]:
-    """Masses (and ids) of the first frame from elsewhere, where the file has none."""
-    given, density = options.get("masses"), options.get("density")
-    n = len(frame.ids)
-    if frame.masses is not None:
-        if given is not None or density is not None:
-            raise checks.fail(
-                "masses" if given is not None else "density",
-                f"be left out, as {file.path.name} has masses",
-                given if given is not None else density,
-            )
-        return {}
-    if density is not None:
-        if frame.radii is None:
-            raise checks.fail(f"{at}: radius", "be in the file for masses from a density", "none")
-        volume = math.pi * frame.radii**2 if len(frame.axes) == 2 else 4 / 3 * math.pi * frame.radii**3
-        if bool((volume == 0).any()):
-            raise checks.fail(f"{at}: radius", "be positive for masses from a density", "0")
-        return {"masses": density * volume}
-    if given is None:
-        beside = file.format.sibling(file.path)
-        if beside is None:
-            return {}
-        try:
-            return {"masses": _of_restart(at, frame, mercury.read_restart(readable("masses", beside)), beside.name)}
-        except checks.FieldError as error:
-            warn(f"{at}: masses", f"none, as the file beside it cannot serve: {error}")
-            return {}
-    if isinstance(given, (str, os.PathLike)):
-        path = readable("masses", Path(given))
-        return {"masses": _of_restart(at, frame, mercury.read_restart(path), path.name)}
-    if isinstance(given, Mapping):
-        if types is None:
-            raise checks.fail(f"{at}: type", "be in the file for masses of types", "none")
-        unknown = [int(kind) for kind in np.unique(types) if int(kind) not in given]
-        if unknown:
-            raise checks.fail("masses", f"hold the type {unknown[0]} of {at}", checks.shown(dict(given)))
-        known = {kind: checks.number("masses", value, above=0.0) for kind, value in given.items()}
-        return {"masses": torch.tensor([known[int(kind)] for kind in types], dtype=torch.float64)}
-    values = checks.real_tensor("masses", given).to(torch.float64)
-    if values.ndim > 1 or (values.ndim == 1 and len(values) != n):
-        raise checks.fail("masses", f"be a number or {n} numbers, one for each id", f"shape {tuple(values.shape)}")
-    checks.first_bad("masses", "be positive", values, values <= 0, "particle")
-    return {"masses": values.expand(n).clone()}
-
-
-def _of_restart(at: str, frame: Frame, found: dict[str, np.ndarray], name: str) -> Tensor:
-    """Masses from a .restart file, whose particles are in the order of the .data file's rows."""
-    if len(found["mass"]) != len(frame.ids):
-        raise checks.fail(f"{name}: Particles", f"be the {len(frame.ids)} of {at}", len(found["mass"]))
-    radii = torch.from_numpy(found["radius"])
-    if frame.radii is not None:
-        # Text of both files has ten digits or more.
-        bad = (radii - frame.radii).abs() > 1e-6 * frame.radii
-        if bool(bad.any()):
-            i = int(bad.nonzero()[0])
-            raise checks.fail(
-                f"{name}: radius",
-                f"be that of {at}",
-                f"{float(radii[i]):g} against {float(frame.radii[i]):g} of particle {i}",
-            )
-    return torch.from_numpy(found["mass"])
-
-
-def _contacts(at: str, columns: dict[str, np.ndarray], frame: Frame, name: str) -> Contacts:
-    """Contacts with ids turned into places."""
-    ids = frame.ids.numpy()
-    pairs = np.empty((len(columns["id1"]), 2), dtype=np.int64)
-    for side in (0, 1):
-        wanted = columns[f"id{side + 1}"]
-        place = np.searchsorted(ids, wanted).clip(max=len(ids) - 1)
-        wall = wanted == -1 if side else np.zeros(len(wanted), dtype=bool)
-        bad = (ids[place] != wanted) & ~wall
-        if bad.any():
-            raise checks.fail(f"{at}: id{side + 1}", f"be that of a particle of {name}", int(wanted[bad][0]))
-        pairs[:, side] = np.where(wall, -1, place)
-    same = pairs[:, 0] == pairs[:, 1]
-    if same.any():
-        raise checks.fail(f"{at}: contacts", "join two particles", f"id {int(ids[pairs[same][0, 0]])} with itself")
-    rest = {name: torch.from_numpy(np.ascontiguousarray(v, dtype=np.float64)) for name, v in columns.items()}
-    overlap = rest.get("overlap")
-    if overlap is None and "distance" in rest and frame.radii is not None:
-        overlap = frame.radii[pairs].sum(-1) - rest["distance"]  # a list with distances has no walls
-    return Contacts(torch.from_numpy(pairs), overlap, rest.get("normal_force"))
-
-
-def _own_contacts(at: str, found: dict[str, np.ndarray], n: int) -> Contacts:
-    """Contacts of a netCDF file, whose pairs are places already."""
-    pairs = torch.from_numpy(np.ascontiguousarray(found["pairs"], dtype=np.int64))
-    if bool(((pairs < -1) | (pairs >= n)).any()):
-        raise checks.fail(f"{at}: contact_pair", f"be places from 0 to {n - 1}, or -1", f"{int(pairs.max())}")
-    rest = [
-        torch.from_numpy(np.ascontiguousarray(found[field], dtype=np.float64)) if field in found else None
-        for field in ("overlap", "normal_force")
-    ]
-    return Contacts(pairs, rest[0], rest[1])
 
 
 def convert(
