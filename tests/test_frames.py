@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import doctest
 import gzip
+import importlib
 import importlib.util
 import itertools
 import math
@@ -163,6 +165,7 @@ def test_lammps_makes_the_stored_dumps_again(tmp_path):
             assert (old.positions - new.positions).abs().max() < 1e-10
 
 
+@pytest.mark.filterwarnings("ignore::torchchain.TrustWarning")
 def test_a_master_equation_from_imported_energies_is_as_good_as_the_ensemble():
     """Energies by the library stand for dumps; the second half of the chains is not seen by the fit."""
     config = replace(lammps_chains.Config(), n_particles=32, n_bands=4, realizations=40)
@@ -789,7 +792,14 @@ def test_no_velocities(motion, file):
             ask()
 
 
-# The registry
+# The manual and the registry
+
+
+def test_the_manual_runs():
+    module = importlib.import_module("torchchain.frames.reading")
+    done = doctest.testmod(module)
+    assert done.attempted >= 8
+    assert done.failed == 0
 
 
 def test_a_format_states_itself():

@@ -33,7 +33,7 @@ def read_frames(
     format: str | None = None,
     **options: Any,
 ) -> Frames:
-    """Frames of a trajectory that another code wrote.
+    r"""Frames of a trajectory that another code wrote.
 
     One pass looks at the headers and counts rows; positions are read when a frame is asked for.
 
@@ -58,9 +58,18 @@ def read_frames(
     Warns:
         FramesWarning: for a last frame that is cut short, which is left out.
 
-    Example:
-        >>> frames = read_frames("run.dump")  # doctest: +SKIP
-        >>> chain, path = frames.chain(boundary="periodic"), frames.trajectory()  # doctest: +SKIP
+    >>> from pathlib import Path
+    >>> from tempfile import mkdtemp
+    >>> frame = "ITEM: TIMESTEP\n{0}\nITEM: NUMBER OF ATOMS\n2\nITEM: ATOMS id mass xu vx\n1 0.9 0 {0}\n2 1.1 1 0\n"
+    >>> path = Path(mkdtemp(), "run.dump")
+    >>> written = path.write_text(frame.format(0) + frame.format(1))
+    >>> frames = read_frames(path, time_step=0.01)
+    >>> frames
+    Frames('run.dump', lammps: 2 frames of 2 particles)
+    >>> frames.chain("fixed").masses.tolist(), frames.trajectory().velocity.tolist()
+    ([0.9, 1.1], [[0.0, 0.0], [1.0, 0.0]])
+    >>> read_frames(convert(path, path.with_name("run.nc"), time_step=0.01))
+    Frames('run.nc', netcdf: 2 frames of 2 particles)
     """
     return Frames(*find(path, contacts, format, options))
 
