@@ -1,5 +1,6 @@
 """Networks in one, two and three dimensions: lattices and packings, their modes, motion and wave energy."""
 
+from torchchain.network.evolvers import METHODS, evolve
 from torchchain.network.lattices import Lattice, dispersion, lattice
 from torchchain.network.modes import (
     FloppyWarning,
@@ -14,18 +15,22 @@ from torchchain.network.modes import (
 )
 from torchchain.network.networks import Network
 from torchchain.network.packings import Packing, packing, rattlers, subnetwork, without_rattlers
+from torchchain.network.trajectories import NetworkTrajectory
 
 __all__ = [
+    "METHODS",
     "FloppyWarning",
     "Lattice",
     "Network",
     "NetworkModes",
+    "NetworkTrajectory",
     "Packing",
     "Softness",
     "UnstableError",
     "check_stability",
     "components",
     "dispersion",
+    "evolve",
     "lattice",
     "normal_modes",
     "packing",

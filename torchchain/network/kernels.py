@@ -1,0 +1,313 @@
+"""Chebyshev recursions on networks: the Numba kernels behind :mod:`torchchain.network.chebyshev`.
+
+With x = 1 - 2 M^-1 K / W^2, each kernel computes T_k = 2 x T_k-1 - T_k-2 on some of the particles, in place of T_k-2,
+and on every third step adds three terms to the sums for the outputs, whose T it has at hand. Every particle gathers the
+pulls of its own bonds, so that threads share no cell and the result does not depend on their number.
+
+Two layouts: *gathered*, the neighbors of every particle listed, for any network; and *rows*, for lattices, where the
+neighbors of a row of particles are rows, the loops run along them, and nothing need be looked up.
+
+Importing this file imports Numba.
+"""
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+_U = np.uint64
+
+
+@_kernel
+def gathered_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, fields, first):
+    """One step for one component; a field is a column of ``old`` and ``now``, (particle, field)."""
+    for p in range(_U(begin), _U(end)):
+        w = weight[p]
+        for r in range(_U(fields)):
+            x = now[p, r]
+            f = 0.0
+            for s in range(starts[p], starts[p + _U(1)]):
+                f += stiff[s] * (now[ends[s], r] - x)
+            if first:
+                old[p, r] = x + 0.5 * w * f
+            else:
+                old[p, r] = w * f + (2.0 * x - old[p, r])
+
+
+@_kernel
+def gathered_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, fields, first):
+    """One step for two components; columns (field, component)."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        w = weight[p]
+        low, high = starts[p], starts[p + _U(1)]
+        for r in range(_U(fields)):
+            a = _U(2) * r
+            b = a + _U(1)
+            x, y = now[p, a], now[p, b]
+            f, g = 0.0, 0.0
+            if prestressed or signed:
+                for s in range(low, high):
+                    q = ends[s]
+                    dx, dy = now[q, a] - x, now[q, b] - y
+                    nx, ny = directions[s, 0], directions[s, 1]
+                    pull = nx * dx + ny * dy
+                    if signed:
+                        pull = stiff[s] * pull
+                    f += nx * pull
+                    g += ny * pull
+                    if prestressed:
+                        f += across[s] * dx
+                        g += across[s] * dy
+            else:
+                for s in range(low, high):
+                    q = ends[s]
+                    nx, ny = directions[s, 0], directions[s, 1]
+                    pull = nx * (now[q, a] - x) + ny * (now[q, b] - y)
+                    f += nx * pull
+                    g += ny * pull
+            if first:
+                old[p, a] = x + 0.5 * w * f
+                old[p, b] = y + 0.5 * w * g
+            else:
+                old[p, a] = w * f + (2.0 * x - old[p, a])
+                old[p, b] = w * g + (2.0 * y - old[p, b])
+
+
+@_kernel
+def gathered_3(begin, end, old, now, weight, starts, ends, stiff, directions, across, fields, first):
+    """One step for three components."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        w = weight[p]
+        low, high = starts[p], starts[p + _U(1)]
+        for r in range(_U(fields)):
+            a = _U(3) * r
+            b = a + _U(1)
+            c = a + _U(2)
+            x, y, z = now[p, a], now[p, b], now[p, c]
+            f, g, h = 0.0, 0.0, 0.0
+            for s in range(low, high):
+                q = ends[s]
+                dx, dy, dz = now[q, a] - x, now[q, b] - y, now[q, c] - z
+                nx, ny, nz = directions[s, 0], directions[s, 1], directions[s, 2]
+                pull = nx * dx + ny * dy + nz * dz
+                if signed:
+                    pull = stiff[s] * pull
+                f += nx * pull
+                g += ny * pull
+                h += nz * pull
+                if prestressed:
+                    t = across[s]
+                    f += t * dx
+                    g += t * dy
+                    h += t * dz
+            if first:
+                old[p, a] = x + 0.5 * w * f
+                old[p, b] = y + 0.5 * w * g
+                old[p, c] = z + 0.5 * w * h
+            else:
+                old[p, a] = w * f + (2.0 * x - old[p, a])
+                old[p, b] = w * g + (2.0 * y - old[p, b])
+                old[p, c] = w * h + (2.0 * z - old[p, c])
+
+
+@_kernel
+def _terms(k, last, table):
+    """How many of T_k-2, T_k-1, T_k are added at step k, and their factors (output, 3, 2, field)."""
+    count = 3 if k % 3 == 2 else (k % 3 + 1 if k == last else 0)
+    terms = np.zeros((len(table), 3, 2, table.shape[3]))
+    for back in range(count):
+        terms[:, 2 - back] = table[:, k - back]
+    return count, terms
+
+
+@_kernel
+def gathered(
+    steps, last, begin, end, tile, cells, weight, starts, ends, stiff, directions, across, fields, keep, sums, table
+):
+    """Some steps on particles begin to end - 1, a tile at a time, the sums added to while the tile is in cache.
+
+    Args:
+        steps: the steps k, as a range (first, after the last); step k makes T_k of T_k-1 and T_k-2.
+        last: the last step of all, at which the terms not yet added are.
+        tile: particles treated at a time.
+        cells: (2, particle, column), T_k in cells[k % 2].
+        weight: 4 / (W^2 m), (particle,).
+        starts, ends: neighbors of particle p are ends[starts[p] : starts[p + 1]].
+        stiff, directions, across: of each of these bonds, with one component its k; with more the sign of k - T / L
+            (empty where none is negative), n times the root of its size (slot, component), and T / L (empty without tension).
+        fields: T u, T v, or both: columns are (field, component).
+        keep: scratch (tile, column).
+        sums: (output, 2, particle, component), displacement and velocity.
+        table: (output, term, 2, field), what each T of each field contributes to displacement and velocity.
+    """
+    columns = cells.shape[2]
+    components = columns // fields
+    for k in range(steps[0], steps[1]):
+        old, now = cells[k % 2], cells[(k + 1) % 2]
+        count, terms = _terms(k, last, table)
+        for low in range(begin, end, tile):
+            high = min(low + tile, end)
+            if count:
+                for p in range(low, high):
+                    for c in range(columns):
+                        keep[p - low, c] = old[p, c]
+            first = k == 1
+            if components == 1:
+                gathered_1(low, high, old, now, weight, starts, ends, stiff, directions, across, fields, first)
+            elif components == 2:
+                gathered_2(low, high, old, now, weight, starts, ends, stiff, directions, across, fields, first)
+            else:
+                gathered_3(low, high, old, now, weight, starts, ends, stiff, directions, across, fields, first)
+            if count:
+                _add(low, high, keep, old, now, fields, sums, terms)
+
+
+@_kernel
+def _add(low, high, keep, new, now, fields, sums, terms):
+    components = new.shape[1] // fields
+    for j in range(len(terms)):
+        for r in range(fields):
+            a0, a1, a2 = terms[j, 0, 0, r], terms[j, 1, 0, r], terms[j, 2, 0, r]
+            b0, b1, b2 = terms[j, 0, 1, r], terms[j, 1, 1, r], terms[j, 2, 1, r]
+            if a0 == 0 and a1 == 0 and a2 == 0 and b0 == 0 and b1 == 0 and b2 == 0:
+                continue
+            for p in range(low, high):
+                for c in range(components):
+                    q = r * components + c
+                    t0, t1, t2 = keep[p - low, q], now[p, q], new[p, q]
+                    sums[j, 0, p, c] += a0 * t0 + a1 * t1 + a2 * t2
+                    sums[j, 1, p, c] += b0 * t0 + b1 * t1 + b2 * t2
+
+
+@_kernel
+def rows(steps, last, begin, end, cells, weight, neighbors, shifts, stiff, directions, across, pad, fields, wrap, force, keep, sums, table):
+    """Some steps on rows begin to end - 1 of a lattice.
+
+    Args:
+        steps, last, fields, table: as for :func:`gathered`.
+        cells: (2, field and component, row, width + 2 pad), T_k in cells[k % 2]; the pads hold copies of the other end,
+            or walls at rest; the last row, beyond those of the lattice, is at rest.
+        weight: (row, width).
+        neighbors: of each row by each lattice step, (row, step).
+        shifts: along the row by each lattice step, (step,).
+        stiff: (step, 1, 1) for equal bonds, else (step, row, width), zero where there is no bond.
+        directions: (step, component); all 1 for one component.
+        across: in the shape of ``stiff``; empty without tension.
+        wrap: whether the rows are rings.
+        force, keep: scratch (component, width).
+        sums: (output, 2, component, row, width).
+    """
+    components = directions.shape[1]
+    varied = stiff.shape[1] * stiff.shape[2] > 1
+    prestressed = len(across) > 0
+    width = force.shape[1]
+    for k in range(steps[0], steps[1]):
+        old, now = cells[k % 2], cells[(k + 1) % 2]
+        count, terms = _terms(k, last, table)
+        for row in range(begin, end):
+            line = row if varied else 0
+            for r in range(fields):
+                force[:, :] = 0.0
+                for s in range(len(shifts)):
+                    there, shift = neighbors[row, s], pad + shifts[s]
+                    a = components * r
+                    if components == 1:
+                        _pull_1(force[0], now[a, row], now[a, there], pad, shift, stiff[s, line], varied, width)
+                    elif components == 2:
+                        _pull_2(
+                            force[0], force[1], now[a, row], now[a, there], now[a + 1, row], now[a + 1, there], pad,
+                            shift, stiff[s, line], varied, directions[s, 0], directions[s, 1], width,
+                        )
+                    else:
+                        _pull_3(
+                            force[0], force[1], force[2], now[a, row], now[a, there], now[a + 1, row],
+                            now[a + 1, there], now[a + 2, row], now[a + 2, there], pad, shift, stiff[s, line], varied,
+                            directions[s, 0], directions[s, 1], directions[s, 2], width,
+                        )
+                    if prestressed:
+                        for c in range(components):
+                            _pull_1(force[c], now[a + c, row], now[a + c, there], pad, shift, across[s, line], varied, width)
+                for c in range(components):
+                    q = components * r + c
+                    if count:
+                        for i in range(width):
+                            keep[c, i] = old[q, row, pad + i]
+                    _close(old[q, row], now[q, row], force[c], weight[row], pad, width, k == 1)
+                    if wrap:
+                        for i in range(pad):
+                            old[q, row, i] = old[q, row, width + i]
+                            old[q, row, pad + width + i] = old[q, row, pad + i]
+                    if count:
+                        for j in range(len(terms)):
+                            for kind in range(2):
+                                f0, f1, f2 = terms[j, 0, kind, r], terms[j, 1, kind, r], terms[j, 2, kind, r]
+                                if f0 != 0 or f1 != 0 or f2 != 0:
+                                    _add_row(sums[j, kind, c, row], keep[c], now[q, row], old[q, row], f0, f1, f2, pad, width)
+
+
+@_kernel
+def _pull_1(f, own, other, pad, shift, stiff, varied, width):
+    p, s = _U(pad), _U(shift)
+    if varied:
+        for i in range(_U(width)):
+            f[i] += stiff[i] * (other[s + i] - own[p + i])
+    else:
+        k = stiff[0]
+        for i in range(_U(width)):
+            f[i] += k * (other[s + i] - own[p + i])
+
+
+@_kernel
+def _pull_2(f, g, x, x2, y, y2, pad, shift, stiff, varied, nx, ny, width):
+    p, s = _U(pad), _U(shift)
+    if varied:
+        for i in range(_U(width)):
+            pull = stiff[i] * (nx * (x2[s + i] - x[p + i]) + ny * (y2[s + i] - y[p + i]))
+            f[i] += nx * pull
+            g[i] += ny * pull
+    else:
+        ax, ay = stiff[0] * nx, stiff[0] * ny
+        for i in range(_U(width)):
+            pull = nx * (x2[s + i] - x[p + i]) + ny * (y2[s + i] - y[p + i])
+            f[i] += ax * pull
+            g[i] += ay * pull
+
+
+@_kernel
+def _pull_3(f, g, h, x, x2, y, y2, z, z2, pad, shift, stiff, varied, nx, ny, nz, width):
+    p, s = _U(pad), _U(shift)
+    if varied:
+        for i in range(_U(width)):
+            pull = stiff[i] * (nx * (x2[s + i] - x[p + i]) + ny * (y2[s + i] - y[p + i]) + nz * (z2[s + i] - z[p + i]))
+            f[i] += nx * pull
+            g[i] += ny * pull
+            h[i] += nz * pull
+    else:
+        ax, ay, az = stiff[0] * nx, stiff[0] * ny, stiff[0] * nz
+        for i in range(_U(width)):
+            pull = nx * (x2[s + i] - x[p + i]) + ny * (y2[s + i] - y[p + i]) + nz * (z2[s + i] - z[p + i])
+            f[i] += ax * pull
+            g[i] += ay * pull
+            h[i] += az * pull
+
+
+@_kernel
+def _close(old, now, force, weight, pad, width, first):
+    p = _U(pad)
+    if first:
+        for i in range(_U(width)):
+            old[p + i] = now[p + i] + 0.5 * weight[i] * force[i]
+    else:
+        for i in range(_U(width)):
+            old[p + i] = weight[i] * force[i] + (2.0 * now[p + i] - old[p + i])
+
+
+@_kernel
+def _add_row(total, keep, now, new, a, b, c, pad, width):
+    p = _U(pad)
+    for i in range(_U(width)):
+        total[i] += a * keep[i] + b * now[p + i] + c * new[p + i]
