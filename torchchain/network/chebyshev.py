@@ -245,7 +245,14 @@ class Rows:
         self.shifts = steps[:, -1].astype(np.int64)
         self.wrap = network.boundary[-1] == "periodic"
         vectors = steps @ primitive
-        self.directions = vectors if self.components > 1 else np.ones((len(steps), 1))
+        directions = vectors if self.components > 1 else np.ones((len(steps), 1))
+        # No step of these lattices has three components: the two largest, the second perhaps zero.
+        self.axes = np.argsort(-np.abs(directions), axis=1, kind="stable")[:, :2]
+        self.axes = self.axes if self.components > 1 else np.zeros((len(steps), 2), np.int64)
+        self.ratios = np.take_along_axis(directions, self.axes, axis=1)
+        self.ratios[np.abs(self.ratios) < 1e-12] = 0.0
+        if self.components == 1:
+            self.ratios[:, 1] = 0.0
         self.masses = _flat(network.masses)
         self.stiffness = _flat(network.bond_stiffness)
         prestressed = network.is_prestressed and self.components > 1
@@ -290,10 +297,11 @@ class Rows:
             stiff, across = (np.ascontiguousarray(x) for x in np.broadcast_arrays(stiff - across, across))
 
         def run(steps: tuple[int, int], last: int, begin: int, end: int, cells: np.ndarray, sums: np.ndarray, table: np.ndarray) -> None:
-            force, keep = np.empty((2, self.components, self.width))
+            force, keep = np.empty((2, self.width))
+            pulls = np.empty((len(self.shifts), self.width))
             kernels.rows(
-                steps, last, begin, end, cells, weight, self.neighbors, self.shifts, stiff, self.directions, across, PAD,
-                cells.shape[1] // self.components, self.wrap, force, keep, sums, table,
+                steps, last, begin, end, cells, weight, self.neighbors, self.shifts, stiff, self.axes, self.ratios, across,
+                PAD, cells.shape[1] // self.components, self.components, self.wrap, pulls, force, keep, sums, table,
             )  # fmt: skip
 
         return run

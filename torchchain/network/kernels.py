@@ -184,130 +184,142 @@ def _add(low, high, keep, new, now, fields, sums, terms):
 
 
 @_kernel
-def rows(steps, last, begin, end, cells, weight, neighbors, shifts, stiff, directions, across, pad, fields, wrap, force, keep, sums, table):
+def rows(
+    steps, last, begin, end, cells, weight, neighbors, shifts, stiff, axes, parts, across, pad, fields, components,
+    wrap, pulls, force, keep, sums, table,
+):  # fmt: skip
     """Some steps on rows begin to end - 1 of a lattice.
+
+    Each loop runs along a row and writes one array: with more, the compiler's tests for overlapping arrays become so
+    many that it gives up vectorizing.
 
     Args:
         steps, last, fields, table: as for :func:`gathered`.
         cells: (2, field and component, row, width + 2 pad), T_k in cells[k % 2]; the pads hold copies of the other end,
             or walls at rest; the last row, beyond those of the lattice, is at rest.
         weight: (row, width).
-        neighbors: of each row by each lattice step, (row, step).
+        neighbors: of each row by each lattice step, (row, step); the second half of the steps are opposite to the first.
         shifts: along the row by each lattice step, (step,).
-        stiff: (step, 1, 1) for equal bonds, else (step, row, width), zero where there is no bond.
-        directions: (step, component); all 1 for one component.
-        across: in the shape of ``stiff``; empty without tension.
+        stiff: k - T / L, (step, 1, 1) for equal bonds, else (step, row, width), zero where there is no bond.
+        axes, parts: the two components of each step's direction that are not zero, (step, 2), and their values; the
+            second value is zero where only one is not.
+        across: T / L in the shape of ``stiff``; empty without tension.
         wrap: whether the rows are rings.
-        force, keep: scratch (component, width).
+        pulls: scratch (step, width).
+        force: scratch (width,).
+        keep: scratch (width,).
         sums: (output, 2, component, row, width).
     """
-    components = directions.shape[1]
     varied = stiff.shape[1] * stiff.shape[2] > 1
-    prestressed = len(across) > 0
-    width = force.shape[1]
+    half = len(shifts) // 2
+    used = len(shifts) if varied else half
+    width = len(force)
     for k in range(steps[0], steps[1]):
         old, now = cells[k % 2], cells[(k + 1) % 2]
         count, terms = _terms(k, last, table)
         for row in range(begin, end):
-            line = row if varied else 0
             for r in range(fields):
-                force[:, :] = 0.0
-                for s in range(len(shifts)):
-                    there, shift = neighbors[row, s], pad + shifts[s]
-                    a = components * r
-                    if components == 1:
-                        _pull_1(force[0], now[a, row], now[a, there], pad, shift, stiff[s, line], varied, width)
-                    elif components == 2:
-                        _pull_2(
-                            force[0], force[1], now[a, row], now[a, there], now[a + 1, row], now[a + 1, there], pad,
-                            shift, stiff[s, line], varied, directions[s, 0], directions[s, 1], width,
-                        )
+                base = components * r
+                for s in range(used):
+                    a, b = base + axes[s, 0], base + axes[s, 1]
+                    x, y, there, shift = now[a, row], now[b, row], neighbors[row, s], pad + shifts[s]
+                    x2, y2 = now[a, there, shift:], now[b, there, shift:]
+                    m, n = parts[s, 0], parts[s, 1]
+                    if varied and n == 0:
+                        _pull_one(pulls[s], x[pad:], x2, stiff[s, row], m, width)
+                    elif varied:
+                        _pull_two(pulls[s], x[pad:], x2, y[pad:], y2, stiff[s, row], m, n, width)
                     else:
-                        _pull_3(
-                            force[0], force[1], force[2], now[a, row], now[a, there], now[a + 1, row],
-                            now[a + 1, there], now[a + 2, row], now[a + 2, there], pad, shift, stiff[s, line], varied,
-                            directions[s, 0], directions[s, 1], directions[s, 2], width,
-                        )
-                    if prestressed:
-                        for c in range(components):
-                            _pull_1(force[c], now[a + c, row], now[a + c, there], pad, shift, across[s, line], varied, width)
+                        back, shift = neighbors[row, s + half], pad + shifts[s + half]
+                        x3, y3, stiffness = now[a, back, shift:], now[b, back, shift:], stiff[s, 0, 0]
+                        if n == 0:
+                            _bend_one(pulls[s], x[pad:], x2, x3, stiffness * m, width)
+                        else:
+                            _bend_two(pulls[s], x[pad:], x2, x3, y[pad:], y2, y3, stiffness * m, stiffness * n, width)
                 for c in range(components):
-                    q = components * r + c
+                    q = base + c
+                    new, x = old[q, row], now[q, row]
+                    force[:] = 0.0
+                    for s in range(used):
+                        for e in range(2):
+                            if axes[s, e] == c and parts[s, e] != 0:
+                                _scale_add(force, pulls[s], parts[s, e], width)
+                    if len(across):
+                        for s in range(used):
+                            x2 = now[q, neighbors[row, s], pad + shifts[s] :]
+                            if varied:
+                                _pull_across(force, x[pad:], x2, across[s, row], width)
+                            else:
+                                x3 = now[q, neighbors[row, s + half], pad + shifts[s + half] :]
+                                _bend_across(force, x[pad:], x2, x3, across[s, 0, 0], width)
                     if count:
-                        for i in range(width):
-                            keep[c, i] = old[q, row, pad + i]
-                    _close(old[q, row], now[q, row], force[c], weight[row], pad, width, k == 1)
+                        keep[:] = new[pad : pad + width]
+                    _close(new[pad:], x[pad:], force, weight[row], width, k == 1)
                     if wrap:
                         for i in range(pad):
-                            old[q, row, i] = old[q, row, width + i]
-                            old[q, row, pad + width + i] = old[q, row, pad + i]
+                            new[i] = new[width + i]
+                            new[pad + width + i] = new[pad + i]
                     if count:
                         for j in range(len(terms)):
                             for kind in range(2):
                                 f0, f1, f2 = terms[j, 0, kind, r], terms[j, 1, kind, r], terms[j, 2, kind, r]
                                 if f0 != 0 or f1 != 0 or f2 != 0:
-                                    _add_row(sums[j, kind, c, row], keep[c], now[q, row], old[q, row], f0, f1, f2, pad, width)
+                                    _add_row(sums[j, kind, c, row], keep, x[pad:], new[pad:], f0, f1, f2, width)
 
 
 @_kernel
-def _pull_1(f, own, other, pad, shift, stiff, varied, width):
-    p, s = _U(pad), _U(shift)
-    if varied:
-        for i in range(_U(width)):
-            f[i] += stiff[i] * (other[s + i] - own[p + i])
-    else:
-        k = stiff[0]
-        for i in range(_U(width)):
-            f[i] += k * (other[s + i] - own[p + i])
+def _pull_one(pull, x, x2, stiff, m, width):
+    for i in range(_U(width)):
+        pull[i] = stiff[i] * (m * (x2[i] - x[i]))
 
 
 @_kernel
-def _pull_2(f, g, x, x2, y, y2, pad, shift, stiff, varied, nx, ny, width):
-    p, s = _U(pad), _U(shift)
-    if varied:
-        for i in range(_U(width)):
-            pull = stiff[i] * (nx * (x2[s + i] - x[p + i]) + ny * (y2[s + i] - y[p + i]))
-            f[i] += nx * pull
-            g[i] += ny * pull
-    else:
-        ax, ay = stiff[0] * nx, stiff[0] * ny
-        for i in range(_U(width)):
-            pull = nx * (x2[s + i] - x[p + i]) + ny * (y2[s + i] - y[p + i])
-            f[i] += ax * pull
-            g[i] += ay * pull
+def _pull_two(pull, x, x2, y, y2, stiff, m, n, width):
+    for i in range(_U(width)):
+        pull[i] = stiff[i] * (m * (x2[i] - x[i]) + n * (y2[i] - y[i]))
 
 
 @_kernel
-def _pull_3(f, g, h, x, x2, y, y2, z, z2, pad, shift, stiff, varied, nx, ny, nz, width):
-    p, s = _U(pad), _U(shift)
-    if varied:
-        for i in range(_U(width)):
-            pull = stiff[i] * (nx * (x2[s + i] - x[p + i]) + ny * (y2[s + i] - y[p + i]) + nz * (z2[s + i] - z[p + i]))
-            f[i] += nx * pull
-            g[i] += ny * pull
-            h[i] += nz * pull
-    else:
-        ax, ay, az = stiff[0] * nx, stiff[0] * ny, stiff[0] * nz
-        for i in range(_U(width)):
-            pull = nx * (x2[s + i] - x[p + i]) + ny * (y2[s + i] - y[p + i]) + nz * (z2[s + i] - z[p + i])
-            f[i] += ax * pull
-            g[i] += ay * pull
-            h[i] += az * pull
+def _bend_one(pull, x, x2, x3, m, width):
+    for i in range(_U(width)):
+        pull[i] = m * ((x2[i] - x[i]) + (x3[i] - x[i]))
 
 
 @_kernel
-def _close(old, now, force, weight, pad, width, first):
-    p = _U(pad)
+def _bend_two(pull, x, x2, x3, y, y2, y3, m, n, width):
+    for i in range(_U(width)):
+        pull[i] = m * ((x2[i] - x[i]) + (x3[i] - x[i])) + n * ((y2[i] - y[i]) + (y3[i] - y[i]))
+
+
+@_kernel
+def _pull_across(force, x, x2, across, width):
+    for i in range(_U(width)):
+        force[i] += across[i] * (x2[i] - x[i])
+
+
+@_kernel
+def _bend_across(force, x, x2, x3, across, width):
+    for i in range(_U(width)):
+        force[i] += across * ((x2[i] - x[i]) + (x3[i] - x[i]))
+
+
+@_kernel
+def _scale_add(force, pull, m, width):
+    for i in range(_U(width)):
+        force[i] += m * pull[i]
+
+
+@_kernel
+def _close(new, now, force, weight, width, first):
     if first:
         for i in range(_U(width)):
-            old[p + i] = now[p + i] + 0.5 * weight[i] * force[i]
+            new[i] = now[i] + 0.5 * weight[i] * force[i]
     else:
         for i in range(_U(width)):
-            old[p + i] = weight[i] * force[i] + (2.0 * now[p + i] - old[p + i])
+            new[i] = weight[i] * force[i] + (2.0 * now[i] - new[i])
 
 
 @_kernel
-def _add_row(total, keep, now, new, a, b, c, pad, width):
-    p = _U(pad)
+def _add_row(total, keep, now, new, a, b, c, width):
     for i in range(_U(width)):
-        total[i] += a * keep[i] + b * now[p + i] + c * new[p + i]
+        total[i] += a * keep[i] + b * now[i] + c * new[i]
