@@ -16,6 +16,7 @@ from torchchain.network.modes import (
 from torchchain.network.networks import Network
 from torchchain.network.packings import Packing, packing, rattlers, subnetwork, without_rattlers
 from torchchain.network.trajectories import NetworkTrajectory
+from torchchain.network.verlet import grain_energy
 
 __all__ = [
     "METHODS",
@@ -31,6 +32,7 @@ __all__ = [
     "components",
     "dispersion",
     "evolve",
+    "grain_energy",
     "lattice",
     "normal_modes",
     "packing",

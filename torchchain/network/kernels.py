@@ -323,3 +323,97 @@ def _close(new, now, force, weight, width, first):
 def _add_row(total, keep, now, new, a, b, c, width):
     for i in range(_U(width)):
         total[i] += a * keep[i] + b * now[i] + c * new[i]
+
+
+@_kernel
+def squared_bound(bonds, blocks, own, masses, sweeps):
+    """See :meth:`torchchain.network.networks.Network.squared_frequency_bound`; blocks and own without signs."""
+    n, c = own.shape[0], own.shape[1]
+    x, image = np.ones((n, c)), np.empty((n, c))
+    largest = 0.0
+    for sweep in range(sweeps + 1):
+        for p in range(n):
+            for a in range(c):
+                image[p, a] = 0.0
+                for b in range(c):
+                    image[p, a] += own[p, a, b] * x[p, b]
+        for e in range(len(bonds)):
+            i, j = bonds[e, 0], bonds[e, 1]
+            if i >= n or j >= n:
+                continue
+            for a in range(c):
+                for b in range(c):
+                    image[i, a] += blocks[e, a, b] * x[j, b]
+                    image[j, a] += blocks[e, a, b] * x[i, b]
+        largest, top = 0.0, 0.0
+        for p in range(n):
+            for a in range(c):
+                ratio = image[p, a] / masses[p] / x[p, a]
+                largest = max(largest, ratio)
+                x[p, a] = np.sqrt(x[p, a] * x[p, a] * ratio)
+                top = max(top, x[p, a])
+        scale = 1.0 / max(top, 1e-300)
+        for p in range(n):
+            for a in range(c):
+                x[p, a] = max(x[p, a] * scale, 1e-60)
+    return largest
+
+
+@_kernel
+def grain_force(x, radii, pairs, shifts, hertz, modulus, damping, velocity, force):
+    """Contact forces between grains at x, (particle, component), written to ``force``.
+
+    Args:
+        pairs: (pair, 2); the second grain is taken at its center plus the pair's shift (pair, component).
+        damping: of the change of length of a closed contact; 0 for none.
+    """
+    d = x.shape[1]
+    force[:] = 0.0
+    for e in range(len(pairs)):
+        i, j = pairs[e, 0], pairs[e, 1]
+        square = 0.0
+        for a in range(d):
+            r = x[j, a] - x[i, a] + shifts[e, a]
+            square += r * r
+        reach = radii[i] + radii[j]
+        if square >= reach * reach:
+            continue
+        length = np.sqrt(square)
+        overlap = reach - length
+        push = modulus * overlap
+        if hertz:
+            push *= np.sqrt(overlap) * (2.0 / 3.0)
+        if damping > 0:
+            rate = 0.0
+            for a in range(d):
+                rate += (velocity[j, a] - velocity[i, a]) * (x[j, a] - x[i, a] + shifts[e, a]) / length
+            push -= damping * rate
+        for a in range(d):
+            f = push * (x[j, a] - x[i, a] + shifts[e, a]) / length
+            force[i, a] -= f
+            force[j, a] += f
+
+
+@_kernel
+def grain_steps(x, v, masses, radii, pairs, shifts, hertz, modulus, damping, step, count, origin, limit, force):
+    """Velocity Verlet steps, at most ``count``, until a grain is ``limit`` away from ``origin``; how many were made.
+
+    ``force`` holds that of the state at hand on entry and on return.
+    """
+    n, d = x.shape
+    for made in range(count):
+        far = 0.0
+        for p in range(n):
+            moved = 0.0
+            for a in range(d):
+                v[p, a] += 0.5 * step / masses[p] * force[p, a]
+                x[p, a] += step * v[p, a]
+                moved += (x[p, a] - origin[p, a]) ** 2
+            far = max(far, moved)
+        grain_force(x, radii, pairs, shifts, hertz, modulus, damping, v, force)
+        for p in range(n):
+            for a in range(d):
+                v[p, a] += 0.5 * step / masses[p] * force[p, a]
+        if far > limit * limit:
+            return made + 1
+    return count
