@@ -207,7 +207,15 @@ class Gathered:
             directions = directions * np.sqrt(np.abs(stiff))[:, None]
             stiff = np.sign(stiff) if stiff.min(initial=0) < 0 else np.zeros(0)
 
-        def run(steps: tuple[int, int], last: int, begin: int, end: int, cells: np.ndarray, sums: np.ndarray, table: np.ndarray) -> None:
+        def run(
+            steps: tuple[int, int],
+            last: int,
+            begin: int,
+            end: int,
+            cells: np.ndarray,
+            sums: np.ndarray,
+            table: np.ndarray,
+        ) -> None:
             keep = np.empty((TILE, cells.shape[2]))
             kernels.gathered(
                 steps, last, begin, end, TILE, cells, weight, self.starts, self.ends, stiff, directions, across,
@@ -296,7 +304,15 @@ class Rows:
             across = self._slots(self.across[member])
             stiff, across = (np.ascontiguousarray(x) for x in np.broadcast_arrays(stiff - across, across))
 
-        def run(steps: tuple[int, int], last: int, begin: int, end: int, cells: np.ndarray, sums: np.ndarray, table: np.ndarray) -> None:
+        def run(
+            steps: tuple[int, int],
+            last: int,
+            begin: int,
+            end: int,
+            cells: np.ndarray,
+            sums: np.ndarray,
+            table: np.ndarray,
+        ) -> None:
             force, keep = np.empty((2, self.width))
             pulls = np.empty((len(self.shifts), self.width))
             kernels.rows(
@@ -370,7 +386,9 @@ class CompiledAdvance:
         displacement, velocity = out.reshape(2, *self._shape[:-2], len(later), n, c)
         return NetworkTrajectory(times, displacement, velocity)
 
-    def _march(self, row: int, times: list[float], out: Tensor, pool: ThreadPoolExecutor | None, threads: int) -> np.ndarray:
+    def _march(
+        self, row: int, times: list[float], out: Tensor, pool: ThreadPoolExecutor | None, threads: int
+    ) -> np.ndarray:
         """Writes the states of a row at the times, and returns the last in float64."""
         member = row // self._starts
         w = float(self.frequencies[member])
@@ -411,7 +429,11 @@ class CompiledAdvance:
         else:
             cuts = [parts * i // threads for i in range(threads + 1)]
             for k in range(1, count):
-                list(pool.map(lambda i, k=k: run((k, k + 1), last, cuts[i], cuts[i + 1], cells, sums, table), range(threads)))
+                list(
+                    pool.map(
+                        lambda i, k=k: run((k, k + 1), last, cuts[i], cuts[i + 1], cells, sums, table), range(threads)
+                    )
+                )
         return self.layout.read(sums)
 
 

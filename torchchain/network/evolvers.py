@@ -10,7 +10,9 @@ from torchchain.excitation import State
 from torchchain.network import chebyshev, damped, modal, verlet
 from torchchain.network.networks import Network
 
-METHODS: dict[str, Method] = {entry.name: entry for entry in (modal.METHOD, chebyshev.METHOD, verlet.METHOD, damped.METHOD)}
+METHODS: dict[str, Method] = {
+    entry.name: entry for entry in (modal.METHOD, chebyshev.METHOD, verlet.METHOD, damped.METHOD)
+}
 
 
 def evolve(network: Network, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:

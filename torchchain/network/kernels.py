@@ -331,7 +331,7 @@ def squared_bound(bonds, blocks, own, masses, sweeps):
     n, c = own.shape[0], own.shape[1]
     x, image = np.ones((n, c)), np.empty((n, c))
     largest = 0.0
-    for sweep in range(sweeps + 1):
+    for _ in range(sweeps + 1):
         for p in range(n):
             for a in range(c):
                 image[p, a] = 0.0

@@ -456,7 +456,9 @@ class Network:
         c, n = self.n_components, self.n_particles
         bonds = self.bonds.numpy()
         masses = self.masses.detach().double().reshape(-1, n).numpy()
-        members = zip(blocks.reshape(-1, self.n_bonds, c, c).numpy(), own.reshape(-1, n, c, c).numpy(), masses, strict=True)
+        members = zip(
+            blocks.reshape(-1, self.n_bonds, c, c).numpy(), own.reshape(-1, n, c, c).numpy(), masses, strict=True
+        )
         values = [kernels.squared_bound(bonds, b, o, m, sweeps) for b, o, m in members]
         return torch.tensor(values, dtype=torch.float64).reshape(self.batch_shape)
 

@@ -29,6 +29,8 @@ def check_trajectory(network: Network, trajectory: Trajectory) -> tuple[Tensor, 
     network.check_state(trajectory.displacement)
     if trajectory.displacement.ndim < len(network.batch_shape) + 3:
         raise checks.fail(
-            "trajectory", "have the axes (*batch, time, particle, component)", f"shape {tuple(trajectory.displacement.shape)}"
+            "trajectory",
+            "have the axes (*batch, time, particle, component)",
+            f"shape {tuple(trajectory.displacement.shape)}",
         )
     return trajectory.displacement, trajectory.velocity

@@ -35,7 +35,9 @@ def start(network: Network, state: State, step: float | None = None, linear: boo
         step = SHARE / max(top, rate, 1e-300)
     step = checks.number("step", step, above=0)
     if step * top >= 2 or step * rate >= 2:
-        raise checks.fail("step", f"be less than {2 / max(top, rate):.6g}, the stability limit of method 'verlet'", step)
+        raise checks.fail(
+            "step", f"be less than {2 / max(top, rate):.6g}, the stability limit of method 'verlet'", step
+        )
     if grains:
         assert isinstance(network, Packing)
         return _grains(network, state, step)
@@ -93,7 +95,9 @@ def _grains(network: Packing, state: State, step: float) -> Advance:
     from torchchain.network import kernels  # imports Numba
 
     if state.displacement.device.type != "cpu":
-        raise checks.fail("state", "be on the CPU for grains (linear=True: the network's linear motion)", "another device")
+        raise checks.fail(
+            "state", "be on the CPU for grains (linear=True: the network's linear motion)", "another device"
+        )
     shape, dtype = state.displacement.shape, state.displacement.dtype
     d = network.dimension
     damping = torch.as_tensor(network.damping)
@@ -173,6 +177,7 @@ def grain_energy(network: Packing, trajectory: NetworkTrajectory) -> Tensor:
     Returns:
         (*batch, time).
     """
+
     def stored(length: Tensor) -> Tensor:
         overlap = network.radii[network.bonds].sum(-1) - length
         force, _ = contact_law(overlap, network.contact, network.modulus)
