@@ -38,8 +38,10 @@ from torchchain.network.networks import Network
 from torchchain.network.packings import Packing, packing, rattlers, subnetwork, without_rattlers
 from torchchain.network.spectra import (
     Spectrum,
+    born_rate,
     density_from_moments,
     density_of_states,
+    ordered_density,
     spectral_moments,
     structure_factor,
 )
@@ -75,6 +77,7 @@ __all__ = [
     "band_waves",
     "begin",
     "bond_energy",
+    "born_rate",
     "box_wavevectors",
     "check_stability",
     "components",
@@ -95,6 +98,7 @@ __all__ = [
     "long_time_band_energy",
     "mixture",
     "normal_modes",
+    "ordered_density",
     "packing",
     "particle_energy",
     "plane_wave",

@@ -135,7 +135,7 @@ def plane_wave(
     # Whole turns are left out exactly: the phase is a ratio of integers.
     sites = where.turns.cpu()  # row-major coordinates of the particles, too
     common = math.lcm(*network.shape)
-    cycle = (sites * wrapped * (common // shape)).sum(-1) % common
+    cycle = ((sites * wrapped * (common // shape)).sum(-1) % common).to(torch.float64)
     angle = (2 * math.pi * cycle / common).to(network.positions)
     wave = amplitude * (angle.sin() if phase == "sin" else angle.cos())
     direction = _direction(where.wavevectors[which], network.n_components, polarization, numbers)

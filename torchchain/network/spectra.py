@@ -20,7 +20,7 @@ from torchchain import checks
 from torchchain.network.bands import plane_wave
 from torchchain.network.chebyshev import highest_frequency, layout_of
 from torchchain.network.disorder import uniform
-from torchchain.network.lattices import Lattice
+from torchchain.network.lattices import Lattice, dynamical_matrix, reciprocal
 from torchchain.network.networks import Network
 
 _STARTS = 5  # the random stream of the starts
@@ -201,3 +201,56 @@ def structure_factor(
     moments, top = spectral_moments(network, torch.stack(waves), n_moments)
     density = density_from_moments(moments, top, frequencies).unflatten(0, (-1, 2)).mean(1)
     return Spectrum(frequencies, density)
+
+
+def ordered_density(network: Lattice, edges: Any, points: int = 800) -> Tensor:
+    """Density of states of a uniform lattice without end, unit masses, normalized to 1, (bin,): the mean over each bin.
+
+    Counts the dispersion relation on a grid of wavevectors.
+
+    Args:
+        network: a periodic lattice of equal bonds; its shape does not matter.
+        edges: of the bins of w, ascending, (bin + 1,).
+        points: of the grid along each direction.
+    """
+    if not network.is_uniform:
+        raise checks.fail(
+            "network", "be a periodic lattice of equal bonds for an ordered density of states", network.kind
+        )
+    edges = checks.real_tensor("edges", edges).double()
+    points = checks.integer("points", points, 2)
+    # The grid keeps away from the symmetric lines, whose points would count too often.
+    turns = [(np.arange(points) + 0.37 + 0.11 * a) / points for a in range(network.dimension)]
+    vectors = reciprocal(network.primitive.detach()).double().cpu().numpy()
+    counts, total = np.zeros(len(edges) - 1), 0
+    for first in turns[0]:
+        rest = np.stack(np.meshgrid(*turns[1:], indexing="ij"), axis=-1).reshape(-1, network.dimension - 1)
+        q = np.concatenate([np.full((len(rest), 1), first), rest], axis=1) @ vectors
+        w = np.sqrt(np.linalg.eigvalsh(dynamical_matrix(network, q)).clip(0))
+        counts += np.histogram(w, bins=edges.numpy())[0]
+        total += w.size
+    return torch.from_numpy(counts / total) / edges.diff()
+
+
+def born_rate(network: Lattice, frequencies: Any, strength: float, width: float = 0.02, points: int = 800) -> Tensor:
+    """Decay rate of the energy of a wave by weak mass disorder, Gamma = (pi / 2) xi^2 w^2 g(w), (frequency,).
+
+    The golden rule (Tamura, Phys. Rev. B 27, 858, 1983, for masses whose variance is xi^2), g being the density of states
+    normalized to 1 over all polarizations: in a lattice whose particles see all directions alike each wave scatters into
+    each other mode of its frequency with the mean weight 1 / dimension. The amplitude decays at half of it.
+
+    Args:
+        network: a uniform lattice.
+        frequencies: (frequency,).
+        strength: xi, the standard deviation of the masses over their mean.
+        width: over which g is averaged.
+        points: of the grid behind g; see :func:`ordered_density`.
+    """
+    frequencies = checks.real_tensor("frequencies", frequencies).double()
+    strength = checks.number("strength", strength, at_least=0)
+    rates = []
+    for w in frequencies.reshape(-1).tolist():
+        low = max(w - width / 2, 0.0)
+        g = ordered_density(network, [low, low + width], points)[0]
+        rates.append(math.pi / 2 * strength**2 * w**2 * g)
+    return torch.stack(rates).reshape(frequencies.shape)

@@ -224,6 +224,9 @@ def plane_wave_energy(network: Network, trajectory: Trajectory, largest: float) 
     energy = each.new_zeros(*each.shape[:-1], len(wavevectors) * polarizations)
     energy = energy.index_add(-1, number * polarizations + (kind if polarizations == 2 else 0 * kind), each)
     energy = energy.unflatten(-1, (len(wavevectors), polarizations))
+    if polarizations == 2:  # q = 0 has no direction
+        at_rest = energy[..., :1, :].sum(-1, keepdim=True) * torch.tensor([1.0, network.dimension - 1.0]).to(energy)
+        energy = torch.cat([at_rest / network.dimension, energy[..., 1:, :]], dim=-2)
     total = ((root * velocity).square() + displacement * force).sum((-2, -1)) / 2
     return PlaneWaveEnergy(wavevectors, energy, total - energy.sum((-2, -1)))
 
