@@ -177,14 +177,22 @@ class Gathered:
         place[self.order], place[n] = np.arange(n), n
         owner, end = place[owner], place[end]
         sort = np.lexsort((end, owner))
-        self.ends, self.bond = end[sort].astype(np.uint32), bond[sort]
+        self.ends, self.bond = end[sort], bond[sort]
+        self._offsets: dict[int, np.ndarray] = {}
         self.starts = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=n))]).astype(np.uint64)
         self.parts, self.components = n, c
         self.masses = _flat(network.masses)[:, self.order]
         self.stiffness = _flat(network.bond_stiffness)
         self.across = _flat(network.bond_tension / network.lengths) if network.is_prestressed else None
         directions = network.directions.detach().double().cpu().numpy()
-        self.directions = directions[self.bond] if c > 1 else np.zeros((0, 1))
+        self.directions = directions[self.bond] if c > 1 else np.zeros(0)
+
+    def _ends(self, columns: int) -> np.ndarray:
+        """The neighbors as offsets into cells with so many columns."""
+        if columns not in self._offsets:
+            kind = np.uint32 if (self.parts + 1) * columns < 2**32 else np.uint64
+            self._offsets[columns] = (self.ends * columns).astype(kind)
+        return self._offsets[columns]
 
     def cells(self, fields: list[np.ndarray]) -> np.ndarray:
         cells = np.zeros((2, self.parts + 1, len(fields) * self.components))
@@ -204,7 +212,7 @@ class Gathered:
             if self.across is not None:
                 across = self.across[member][self.bond]
                 stiff = stiff - across
-            directions = directions * np.sqrt(np.abs(stiff))[:, None]
+            directions = (directions * np.sqrt(np.abs(stiff))[:, None]).reshape(-1)
             stiff = np.sign(stiff) if stiff.min(initial=0) < 0 else np.zeros(0)
 
         def run(
@@ -218,8 +226,8 @@ class Gathered:
         ) -> None:
             keep = np.empty((TILE, cells.shape[2]))
             kernels.gathered(
-                steps, last, begin, end, TILE, cells, weight, self.starts, self.ends, stiff, directions, across,
-                cells.shape[2] // self.components, keep, sums, table,
+                steps, last, begin, end, TILE, cells, weight, self.starts, self._ends(cells.shape[2]), stiff, directions,
+                across, cells.shape[2] // self.components, keep, sums, table,
             )  # fmt: skip
 
         return run

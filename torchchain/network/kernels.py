@@ -21,97 +21,212 @@ _U = np.uint64
 
 
 @_kernel
-def gathered_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, fields, first):
-    """One step for one component; a field is a column of ``old`` and ``now``, (particle, field)."""
+def _gathered_1_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for one component of one field; ``ends`` are offsets into ``now``."""
     for p in range(_U(begin), _U(end)):
+        at = _U(1) * p
+        x0 = now[at]
+        fx0 = 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            k = stiff[s]
+            fx0 += k * (now[q] - x0)
         w = weight[p]
-        for r in range(_U(fields)):
-            x = now[p, r]
-            f = 0.0
-            for s in range(starts[p], starts[p + _U(1)]):
-                f += stiff[s] * (now[ends[s], r] - x)
-            if first:
-                old[p, r] = x + 0.5 * w * f
-            else:
-                old[p, r] = w * f + (2.0 * x - old[p, r])
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
 
 
 @_kernel
-def gathered_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, fields, first):
-    """One step for two components; columns (field, component)."""
-    prestressed, signed = len(across) > 0, len(stiff) > 0
+def _gathered_1_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for one component of two fields; ``ends`` are offsets into ``now``."""
     for p in range(_U(begin), _U(end)):
+        at = _U(2) * p
+        x0, x1 = now[at], now[at + _U(1)]
+        fx0, fx1 = 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            k = stiff[s]
+            fx0 += k * (now[q] - x0)
+            fx1 += k * (now[q + _U(1)] - x1)
         w = weight[p]
-        low, high = starts[p], starts[p + _U(1)]
-        for r in range(_U(fields)):
-            a = _U(2) * r
-            b = a + _U(1)
-            x, y = now[p, a], now[p, b]
-            f, g = 0.0, 0.0
-            if prestressed or signed:
-                for s in range(low, high):
-                    q = ends[s]
-                    dx, dy = now[q, a] - x, now[q, b] - y
-                    nx, ny = directions[s, 0], directions[s, 1]
-                    pull = nx * dx + ny * dy
-                    if signed:
-                        pull = stiff[s] * pull
-                    f += nx * pull
-                    g += ny * pull
-                    if prestressed:
-                        f += across[s] * dx
-                        g += across[s] * dy
-            else:
-                for s in range(low, high):
-                    q = ends[s]
-                    nx, ny = directions[s, 0], directions[s, 1]
-                    pull = nx * (now[q, a] - x) + ny * (now[q, b] - y)
-                    f += nx * pull
-                    g += ny * pull
-            if first:
-                old[p, a] = x + 0.5 * w * f
-                old[p, b] = y + 0.5 * w * g
-            else:
-                old[p, a] = w * f + (2.0 * x - old[p, a])
-                old[p, b] = w * g + (2.0 * y - old[p, b])
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = x1 + 0.5 * w * fx1
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fx1 + (2.0 * x1 - old[at + _U(1)])
 
 
 @_kernel
-def gathered_3(begin, end, old, now, weight, starts, ends, stiff, directions, across, fields, first):
-    """One step for three components."""
+def _gathered_2_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for two components of one field; ``ends`` are offsets into ``now``."""
     prestressed, signed = len(across) > 0, len(stiff) > 0
     for p in range(_U(begin), _U(end)):
+        at = _U(2) * p
+        x0, y0 = now[at], now[at + _U(1)]
+        fx0, fy0 = 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            nx, ny = directions[_U(2) * s], directions[_U(2) * s + _U(1)]
+            dx0 = now[q] - x0
+            dy0 = now[q + _U(1)] - y0
+            pull0 = nx * dx0 + ny * dy0
+            if signed:
+                pull0 *= stiff[s]
+            fx0 += nx * pull0
+            fy0 += ny * pull0
+            if prestressed:
+                t = across[s]
+                fx0 += t * dx0
+                fy0 += t * dy0
         w = weight[p]
-        low, high = starts[p], starts[p + _U(1)]
-        for r in range(_U(fields)):
-            a = _U(3) * r
-            b = a + _U(1)
-            c = a + _U(2)
-            x, y, z = now[p, a], now[p, b], now[p, c]
-            f, g, h = 0.0, 0.0, 0.0
-            for s in range(low, high):
-                q = ends[s]
-                dx, dy, dz = now[q, a] - x, now[q, b] - y, now[q, c] - z
-                nx, ny, nz = directions[s, 0], directions[s, 1], directions[s, 2]
-                pull = nx * dx + ny * dy + nz * dz
-                if signed:
-                    pull = stiff[s] * pull
-                f += nx * pull
-                g += ny * pull
-                h += nz * pull
-                if prestressed:
-                    t = across[s]
-                    f += t * dx
-                    g += t * dy
-                    h += t * dz
-            if first:
-                old[p, a] = x + 0.5 * w * f
-                old[p, b] = y + 0.5 * w * g
-                old[p, c] = z + 0.5 * w * h
-            else:
-                old[p, a] = w * f + (2.0 * x - old[p, a])
-                old[p, b] = w * g + (2.0 * y - old[p, b])
-                old[p, c] = w * h + (2.0 * z - old[p, c])
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = y0 + 0.5 * w * fy0
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
+
+
+@_kernel
+def _gathered_2_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for two components of two fields; ``ends`` are offsets into ``now``."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        at = _U(4) * p
+        x0, y0, x1, y1 = now[at], now[at + _U(1)], now[at + _U(2)], now[at + _U(3)]
+        fx0, fy0, fx1, fy1 = 0.0, 0.0, 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            nx, ny = directions[_U(2) * s], directions[_U(2) * s + _U(1)]
+            dx0 = now[q] - x0
+            dy0 = now[q + _U(1)] - y0
+            pull0 = nx * dx0 + ny * dy0
+            dx1 = now[q + _U(2)] - x1
+            dy1 = now[q + _U(3)] - y1
+            pull1 = nx * dx1 + ny * dy1
+            if signed:
+                pull0 *= stiff[s]
+                pull1 *= stiff[s]
+            fx0 += nx * pull0
+            fy0 += ny * pull0
+            fx1 += nx * pull1
+            fy1 += ny * pull1
+            if prestressed:
+                t = across[s]
+                fx0 += t * dx0
+                fy0 += t * dy0
+                fx1 += t * dx1
+                fy1 += t * dy1
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = y0 + 0.5 * w * fy0
+            old[at + _U(2)] = x1 + 0.5 * w * fx1
+            old[at + _U(3)] = y1 + 0.5 * w * fy1
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
+            old[at + _U(2)] = w * fx1 + (2.0 * x1 - old[at + _U(2)])
+            old[at + _U(3)] = w * fy1 + (2.0 * y1 - old[at + _U(3)])
+
+
+@_kernel
+def _gathered_3_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for three components of one field; ``ends`` are offsets into ``now``."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        at = _U(3) * p
+        x0, y0, z0 = now[at], now[at + _U(1)], now[at + _U(2)]
+        fx0, fy0, fz0 = 0.0, 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            nx, ny, nz = directions[_U(3) * s], directions[_U(3) * s + _U(1)], directions[_U(3) * s + _U(2)]
+            dx0 = now[q] - x0
+            dy0 = now[q + _U(1)] - y0
+            dz0 = now[q + _U(2)] - z0
+            pull0 = nx * dx0 + ny * dy0 + nz * dz0
+            if signed:
+                pull0 *= stiff[s]
+            fx0 += nx * pull0
+            fy0 += ny * pull0
+            fz0 += nz * pull0
+            if prestressed:
+                t = across[s]
+                fx0 += t * dx0
+                fy0 += t * dy0
+                fz0 += t * dz0
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = y0 + 0.5 * w * fy0
+            old[at + _U(2)] = z0 + 0.5 * w * fz0
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
+            old[at + _U(2)] = w * fz0 + (2.0 * z0 - old[at + _U(2)])
+
+
+@_kernel
+def _gathered_3_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for three components of two fields; ``ends`` are offsets into ``now``."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        at = _U(6) * p
+        x0, y0, z0, x1, y1, z1 = (
+            now[at],
+            now[at + _U(1)],
+            now[at + _U(2)],
+            now[at + _U(3)],
+            now[at + _U(4)],
+            now[at + _U(5)],
+        )
+        fx0, fy0, fz0, fx1, fy1, fz1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            nx, ny, nz = directions[_U(3) * s], directions[_U(3) * s + _U(1)], directions[_U(3) * s + _U(2)]
+            dx0 = now[q] - x0
+            dy0 = now[q + _U(1)] - y0
+            dz0 = now[q + _U(2)] - z0
+            pull0 = nx * dx0 + ny * dy0 + nz * dz0
+            dx1 = now[q + _U(3)] - x1
+            dy1 = now[q + _U(4)] - y1
+            dz1 = now[q + _U(5)] - z1
+            pull1 = nx * dx1 + ny * dy1 + nz * dz1
+            if signed:
+                pull0 *= stiff[s]
+                pull1 *= stiff[s]
+            fx0 += nx * pull0
+            fy0 += ny * pull0
+            fz0 += nz * pull0
+            fx1 += nx * pull1
+            fy1 += ny * pull1
+            fz1 += nz * pull1
+            if prestressed:
+                t = across[s]
+                fx0 += t * dx0
+                fy0 += t * dy0
+                fz0 += t * dz0
+                fx1 += t * dx1
+                fy1 += t * dy1
+                fz1 += t * dz1
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = y0 + 0.5 * w * fy0
+            old[at + _U(2)] = z0 + 0.5 * w * fz0
+            old[at + _U(3)] = x1 + 0.5 * w * fx1
+            old[at + _U(4)] = y1 + 0.5 * w * fy1
+            old[at + _U(5)] = z1 + 0.5 * w * fz1
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
+            old[at + _U(2)] = w * fz0 + (2.0 * z0 - old[at + _U(2)])
+            old[at + _U(3)] = w * fx1 + (2.0 * x1 - old[at + _U(3)])
+            old[at + _U(4)] = w * fy1 + (2.0 * y1 - old[at + _U(4)])
+            old[at + _U(5)] = w * fz1 + (2.0 * z1 - old[at + _U(5)])
 
 
 @_kernel
@@ -136,9 +251,9 @@ def gathered(
         tile: particles treated at a time.
         cells: (2, particle, column), T_k in cells[k % 2].
         weight: 4 / (W^2 m), (particle,).
-        starts, ends: neighbors of particle p are ends[starts[p] : starts[p + 1]].
+        starts, ends: neighbors of particle p are ends[starts[p] : starts[p + 1]], as offsets into the flat cells.
         stiff, directions, across: of each of these bonds, with one component its k; with more the sign of k - T / L
-            (empty where none is negative), n times the root of its size (slot, component), and T / L (empty without tension).
+            (empty where none is negative), n times the root of its size (slot and component,), and T / L (empty without tension).
         fields: T u, T v, or both: columns are (field, component).
         keep: scratch (tile, column).
         sums: (output, 2, particle, component), displacement and velocity.
@@ -148,6 +263,7 @@ def gathered(
     components = columns // fields
     for k in range(steps[0], steps[1]):
         old, now = cells[k % 2], cells[(k + 1) % 2]
+        to, of = old.reshape(-1), now.reshape(-1)
         count, terms = _terms(k, last, table)
         for low in range(begin, end, tile):
             high = min(low + tile, end)
@@ -156,12 +272,18 @@ def gathered(
                     for c in range(columns):
                         keep[p - low, c] = old[p, c]
             first = k == 1
-            if components == 1:
-                gathered_1(low, high, old, now, weight, starts, ends, stiff, directions, across, fields, first)
-            elif components == 2:
-                gathered_2(low, high, old, now, weight, starts, ends, stiff, directions, across, fields, first)
-            else:
-                gathered_3(low, high, old, now, weight, starts, ends, stiff, directions, across, fields, first)
+            if components == 1 and fields == 1:
+                _gathered_1_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 1 and fields == 2:
+                _gathered_1_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 2 and fields == 1:
+                _gathered_2_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 2 and fields == 2:
+                _gathered_2_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 3 and fields == 1:
+                _gathered_3_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 3 and fields == 2:
+                _gathered_3_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
             if count:
                 _add(low, high, keep, old, now, fields, sums, terms)
 
