@@ -39,6 +39,14 @@ class Config:
     """the same along a bond"""
     triangular_transverse: tuple[float, ...] = (0.11, 0.13, 0.155, 0.18, 0.21, 0.25)
     """the same along a bond"""
+    weak: float = 0.15
+    """below this disorder the waves are shorter: in lines so narrow that few modes of the lattice lie in them, nothing decays"""
+    square_scalar_weak: tuple[float, ...] = (0.145, 0.165, 0.19, 0.215, 0.245, 0.275)
+    """wavelengths per spacing at weak disorder"""
+    triangular_longitudinal_weak: tuple[float, ...] = (0.11, 0.12, 0.13, 0.14, 0.155, 0.17)
+    """the same along a bond"""
+    triangular_transverse_weak: tuple[float, ...] = (0.18, 0.2, 0.22, 0.24, 0.26, 0.285)
+    """the same along a bond"""
     begin: float = 0.1
     """the slope is taken from this share of a decay time on"""
     end: float = 1.0
@@ -103,7 +111,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     rows = []
     for c, case in enumerate(CASES):
         for xi in config.strengths:
-            for share in getattr(config, case.replace(" ", "_")):
+            for share in getattr(config, case.replace(" ", "_") + ("_weak" if xi < config.weak else "")):
                 q, w, born, rate, error = decay(config, case, share, xi)
                 rows.append((c, xi, q, w, born, rate, error))
     names = ("case", "strength", "wavenumber", "frequency", "born", "rate", "rate_stderr")
