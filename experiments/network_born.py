@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 import torchchain as tc
 from torchchain import network as nw
-from torchchain.excitation import State
+from torchchain.chain import State
 
 CASES = ("square scalar", "triangular longitudinal", "triangular transverse")
 

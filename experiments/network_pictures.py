@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 import torchchain as tc
 from torchchain import network as nw
-from torchchain.excitation import State
+from torchchain.chain import State
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from stencil_rates import in_turn
 
 import torchchain as tc
 from torchchain import network as nw
-from torchchain.excitation import State
+from torchchain.chain import State
 from torchchain.network import chebyshev
 
 WAYS = ("scipy CSR", "torch CSR", "one field", "two fields")

@@ -7,7 +7,7 @@ import torch
 from scipy import stats
 
 import torchchain as tc
-from torchchain.bands import center_tones
+from torchchain.energy.bands import center_tones
 from torchchain.checks import FieldError
 from torchchain.theory import born_rates, effective_medium, theory_transfer
 from torchchain.theory.law import law_of

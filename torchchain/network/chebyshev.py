@@ -24,7 +24,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.evolvers.chebyshev import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS, check_work, coefficients
 from torchchain.evolvers.method import Advance, Method
-from torchchain.excitation import State
+from torchchain.chain import State
 from torchchain.network.lattices import PRIMITIVE, STEPS, Lattice
 from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network

@@ -12,7 +12,7 @@ from scipy import special
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.disorder import Disorder
+from torchchain.chain import Disorder
 from torchchain.network.networks import Network
 
 _BONDS, _POSITIONS, _KINDS = 2, 3, 4  # random streams of a realization, besides those of masses and stiffnesses
@@ -39,7 +39,7 @@ def disordered(
 ) -> Network:
     """The network with random factors on its masses and stiffnesses, one network for each realization.
 
-    >>> from torchchain.disorder import Disorder
+    >>> from torchchain.chain import Disorder
     >>> from torchchain.network import lattice
     >>> disordered(lattice("square", (4, 4)), masses=Disorder(strength=0.2), realizations=3).masses.shape
     torch.Size([3, 16])

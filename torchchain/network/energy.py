@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.evolvers.method import Trajectory
+from torchchain.chain.states import Trajectory
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import check_trajectory
 

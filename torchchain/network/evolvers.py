@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from torchchain import checks
-from torchchain.evolvers.method import Advance, Method, Trajectory
-from torchchain.excitation import State
+from torchchain.evolvers.method import Advance, Method
+from torchchain.chain.states import Trajectory
+from torchchain.chain import State
 from torchchain.network import chebyshev, damped, modal, verlet
 from torchchain.network.networks import Network
 
@@ -19,7 +20,7 @@ def evolve(network: Network, state: State, times: Any, method: str = "modes", **
     """States of the network at the given times.
 
     >>> import torch
-    >>> from torchchain.excitation import State
+    >>> from torchchain.chain import State
     >>> from torchchain.network import lattice
     >>> ring = lattice("triangular", (4, 4))
     >>> kick = torch.zeros(16, 2, dtype=torch.float64)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.evolvers.method import Trajectory
-from torchchain.excitation import State
+from torchchain.chain.states import Trajectory
+from torchchain.chain import State
 from torchchain.network.networks import Network
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.evolvers.method import Advance, Method
-from torchchain.excitation import State
+from torchchain.chain import State
 from torchchain.network.networks import Network
 from torchchain.network.packings import Packing, contact_law, near_pairs
 from torchchain.network.trajectories import NetworkTrajectory

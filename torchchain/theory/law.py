@@ -11,7 +11,7 @@ from scipy import special
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.disorder import Disorder
+from torchchain.chain import Disorder
 
 _TAIL = 1e-17  # probability left out beyond the last node
 _POINTS = 400  # of the fine rule that the short one is made from

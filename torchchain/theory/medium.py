@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.disorder import Disorder
+from torchchain.chain import Disorder
 from torchchain.theory.law import Law, law_of
 
 _STEPS, _DAMPED_STEPS = 150, 60

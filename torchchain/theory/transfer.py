@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.bands import center_tones, check_bands
+from torchchain.energy.bands import center_tones, check_bands
 from torchchain.chain import BOUNDARIES, CONTACTS
-from torchchain.disorder import Disorder
+from torchchain.chain import Disorder
 from torchchain.theory.ladder import DECAY, Waves, ladder_transfer, spectrum_edges, stretches
 from torchchain.theory.law import Law, law_of
 from torchchain.theory.localized import MEASURED, Frequencies, Return, interference, onset, source_frequencies
