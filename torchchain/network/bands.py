@@ -241,7 +241,7 @@ def long_time_band_energy(
         n_clusters = int(cluster[-1]) + 1
         for a, b in zip(coordinate[i], speed[i], strict=True):
             # Half of a cluster's energy is kinetic at every phase's mean; a drift's is all of it, and steady: k either way.
-            total = 0
+            total = torch.zeros(()).to(w)
             for weight in (a * w[i], b):
                 parts = shapes[i].movedim(-1, 0) * weight[:, None, None]
                 velocity = torch.zeros(n_clusters, *parts.shape[1:], dtype=parts.dtype, device=parts.device)

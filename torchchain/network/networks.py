@@ -208,7 +208,7 @@ class Network:
         value = checks.real_tensor(name, value).to(self.masses)
         if not signed:
             checks.first_bad(name, "not be negative", value, value < 0, "bond")
-        shape = (*self.batch_shape, self.n_bonds)
+        shape: tuple[int, ...] = (*self.batch_shape, self.n_bonds)
         if value.ndim == 0:
             return value.expand(self.n_bonds)
         if tuple(value.shape) not in (shape, shape[-1:]):
@@ -291,8 +291,8 @@ class Network:
         if self.box is None:
             return vectors
         if self.box.ndim == 1:
-            turns = torch.where(self.box.isfinite(), (vectors / self.box).round(), 0.0)
-            return vectors - torch.where(turns == 0, 0.0, turns * self.box)
+            whole = torch.where(self.box.isfinite(), (vectors / self.box).round(), 0.0)
+            return vectors - torch.where(whole == 0, 0.0, whole * self.box)
         vectors = vectors - (vectors @ torch.linalg.inv(self.box)).round() @ self.box
         best, size = vectors, vectors.square().sum(-1)
         for turns in np.ndindex(*(3,) * self.dimension):  # of a skewed cell, a neighbor's copy can be nearer
@@ -391,8 +391,8 @@ class Network:
         blocks = blocks.expand(*self.batch_shape, self.n_bonds, c, c).flatten(-2)
         i, j = self.bonds.unbind(-1)
         matrix = blocks.new_zeros(*self.batch_shape, all_points * all_points, c * c)
-        for row, column, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
-            matrix = matrix.index_add(-2, row * all_points + column, sign * blocks)
+        for first, second, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            matrix = matrix.index_add(-2, first * all_points + second, sign * blocks)
         matrix = matrix.reshape(*self.batch_shape, all_points, all_points, c, c)[..., :n, :n, :, :]
         return matrix.transpose(-3, -2).reshape(*self.batch_shape, n * c, n * c)
 

@@ -203,10 +203,10 @@ def subnetwork(network: Network, keep: Tensor) -> Network:
         "positions": network.positions[keep],
         "bonds": number[kept.bonds],
     }
-    common = {
+    common: dict[str, Any] = {
         name: getattr(kept, name) for name in ("stiffness", "tension", "damping", "images", "box", "motion", "anchors")
     }
     if isinstance(network, Packing):
-        extra = {"radii": network.radii[keep], "contact": network.contact, "modulus": network.modulus}
+        extra: dict[str, Any] = {"radii": network.radii[keep], "contact": network.contact, "modulus": network.modulus}
         return Packing(**fields, **common, **extra)
     return Network(**fields, **common)
