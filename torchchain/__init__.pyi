@@ -1,4 +1,3 @@
-# ruff: noqa: F401
 # The public names: __all__ holds the everyday ones, the rest resolve as well (also under tc.energy, tc.master).
 from torchchain import energy as energy
 from torchchain import master as master
@@ -80,6 +79,8 @@ from torchchain.results import RunFolder as RunFolder
 from torchchain.results import open_folder as open
 
 __all__ = [
+    "METHODS",
+    "SOLVERS",
     "BandTransfer",
     "Chain",
     "DecompositionError",
@@ -89,7 +90,6 @@ __all__ = [
     "FitWarning",
     "Impulse",
     "LinearityWarning",
-    "METHODS",
     "MasterEquation",
     "MasterFamily",
     "Method",
@@ -97,7 +97,6 @@ __all__ = [
     "Observable",
     "Plan",
     "RunFolder",
-    "SOLVERS",
     "Scaling",
     "Scene",
     "SpectrumWarning",

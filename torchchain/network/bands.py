@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain.states import Trajectory
 from torchchain.chain import PHASES, State
+from torchchain.chain.states import Trajectory
 from torchchain.network.lattices import Lattice
 from torchchain.network.modal import amplitudes
 from torchchain.network.modes import NetworkModes, normal_modes

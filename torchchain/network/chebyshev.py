@@ -22,9 +22,11 @@ from scipy.sparse import coo_matrix, csgraph
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.evolvers.chebyshev import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS, check_work, coefficients
-from torchchain.evolvers.method import Advance, Method
 from torchchain.chain import State
+from torchchain.evolvers.chebyshev import check_work
+from torchchain.evolvers.coefficients import coefficients_of
+from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS
+from torchchain.evolvers.method import Advance, Method
 from torchchain.network.lattices import PRIMITIVE, STEPS, Lattice
 from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network
@@ -110,7 +112,7 @@ def _plain(network: Network, state: State, frequency: Tensor, tolerance: float) 
     now = 0.0
 
     def step(pair: Tensor, interval: np.ndarray) -> Tensor:
-        table = torch.from_numpy(coefficients(frequencies, interval, tolerance)).to(pair)
+        table = torch.from_numpy(coefficients_of(frequencies, interval, tolerance)).to(pair)
         table = table.reshape(*table.shape[:2], *network.batch_shape, *[1] * (pair.ndim - axis - 1))
         older, old = pair, pair + weight / 2 * network.force(pair)
         total: list[Tensor] = []
@@ -423,7 +425,7 @@ class CompiledAdvance:
         self, run: Callable[..., None], state: np.ndarray, w: float, intervals: np.ndarray, pool: Any, threads: int
     ) -> np.ndarray:
         """States (output, 2, particle, component) at some intervals after a state."""
-        cosine, integral, derivative = coefficients(np.full(len(intervals), w), intervals, self.tolerance)
+        cosine, integral, derivative = coefficients_of(np.full(len(intervals), w), intervals, self.tolerance)
         kinds = [kind for kind in (0, 1) if state[kind].any()] or [0]
         count = max(2, len(cosine))
         table = np.zeros((len(intervals), count, 2, len(kinds)))  # (output, term, displacement or velocity, field)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain.states import Trajectory
 from torchchain.chain import State
+from torchchain.chain.states import Trajectory
 from torchchain.network.networks import Network
 
 

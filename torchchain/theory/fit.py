@@ -12,8 +12,8 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.energy.bands import band_of, center_tones
 from torchchain.chain import Disorder
+from torchchain.energy.bands import band_of, center_tones
 from torchchain.theory.transfer import theory_transfer
 
 WEAKEST, STRONGEST = 0.005, 0.8

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.chain import BOUNDARIES, CONTACTS, Disorder
 from torchchain.energy.bands import center_tones, check_bands
-from torchchain.chain import BOUNDARIES, CONTACTS
-from torchchain.chain import Disorder
 from torchchain.theory.ladder import DECAY, Waves, ladder_transfer, spectrum_edges, stretches
 from torchchain.theory.law import Law, law_of
 from torchchain.theory.localized import MEASURED, Frequencies, Return, interference, onset, source_frequencies
@@ -115,7 +114,9 @@ def theory_transfer(
             earlier = onset(2 * times, spectrum, numbers)
             left = torch.exp(-damping * spectrum.nodes.square()[:, None] * times)
             change = (came * left).T @ pattern.T
-            error[s] = _SHAPE_ERROR * _distance(change) + _ONSET_ERROR * _distance(((earlier - came) * left).T @ pattern.T)
+            error[s] = _SHAPE_ERROR * _distance(change) + _ONSET_ERROR * _distance(
+                ((earlier - came) * left).T @ pattern.T
+            )
             if localization:
                 mean[s] += change
             else:
@@ -124,7 +125,11 @@ def theory_transfer(
                 final = pattern.sum(-1)
                 long_time[s] = plain + final if localization else plain
                 long_error[s] = (_SHAPE_ERROR if localization else 1.0) * _distance(final)
-    settings = {"edge": edges[0], "closure": closure, "stretches": stretches(float(times[-1]), edges, decay, waves.momentum)}
+    settings = {
+        "edge": edges[0],
+        "closure": closure,
+        "stretches": stretches(float(times[-1]), edges, decay, waves.momentum),
+    }
     return TheoryTransfer(times, mean, long_time, error, long_error, settings)
 
 
