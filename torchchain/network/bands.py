@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import PHASES, State
+from torchchain.chain import State
+from torchchain.chain.excitation import PHASES
 from torchchain.chain.states import Trajectory
 from torchchain.network.lattices import Lattice
 from torchchain.network.modal import amplitudes
