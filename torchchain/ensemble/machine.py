@@ -16,7 +16,7 @@ from torchchain.chain.chain import Chain
 from torchchain.chain.disorder import Disorder
 from torchchain.chain.excitation import impulse, standing_wave
 from torchchain.ensemble import fused
-from torchchain.evolvers import start
+from torchchain.evolvers import chebyshev, start
 from torchchain.evolvers.expansion import LEAP, terms
 from torchchain.modes.spectrum import normal_modes
 from torchchain.threads import single_thread
@@ -125,10 +125,8 @@ def _read(path: Path) -> Machine | None:
 
 
 def kernels_compiled() -> bool:
-    """Whether Numba holds the stencil's kernels in its cache, beside the source or where $NUMBA_CACHE_DIR says."""
-    own = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(__file__).parents[1] / "evolvers" / "__pycache__"
-    return any(folder.glob("stencil.*.nbi")) if not own else any(Path(own).glob("**/stencil.*.nbi"))
+    """Whether the stencil's kernels need no compiling."""
+    return chebyshev.kernels_compiled()
 
 
 def kernels_loaded() -> bool:

@@ -16,7 +16,6 @@ from torchchain.ensemble.machine import Machine, kernels_loaded
 from torchchain.ensemble.observables import MOMENTS
 from torchchain.ensemble.reach import reach
 from torchchain.ensemble.scene import BAND_OBSERVABLES, Scene
-from torchchain.evolvers.drift import total
 from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, terms
 
 EPS = {torch.float64: 2.0**-53, torch.float32: 2.0**-24}
@@ -88,11 +87,11 @@ class Facts:
         if power in self._frequencies:
             return self._frequencies[power]
         state = self._state
-        first = total(self._linear, state.displacement, state.velocity)
+        first = self._linear.energy(state.displacement, state.velocity)
         for _ in range(power):
             force = self._linear.force(state.displacement)
             state = State(state.velocity, force / self._linear.align(self._linear.masses, force))
-        mean = float((total(self._linear, state.displacement, state.velocity) / first).mean(0).max().sqrt())
+        mean = float((self._linear.energy(state.displacement, state.velocity) / first).mean(0).max().sqrt())
         if self.scene.contact == "hertz":
             harmonics = min(1.0, self.deviation * self.end * mean ** (1 / power))
             mean = max(mean, harmonics * 2.0**power) * (1 + self.elongation) ** (power / 4)
