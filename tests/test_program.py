@@ -157,7 +157,7 @@ def test_help_lists_what_there_is():
 
     assert choices.KINDS == KINDS
     assert choices.BOUNDARIES == BOUNDARIES
-    assert choices.CONTACTS == (*CONTACTS, "auto")
+    assert (*CONTACTS, "auto") == choices.CONTACTS
     assert set(choices.DEFINITIONS) == set(DEFINITIONS)
     assert set(choices.EXCITATIONS) == set(EXCITATIONS)
     assert set(choices.METHODS) == set(tc.METHODS)

@@ -1,4 +1,3 @@
-# ruff: noqa: F401
 # The public names: __all__ holds the everyday ones, the rest resolve as well (also under tc.energy, tc.master).
 from torchchain import energy as energy
 from torchchain import master as master
@@ -78,6 +77,8 @@ from torchchain.results import RunFolder as RunFolder
 from torchchain.results import open_folder as open
 
 __all__ = [
+    "METHODS",
+    "SOLVERS",
     "BandTransfer",
     "Chain",
     "DecompositionError",
@@ -87,14 +88,12 @@ __all__ = [
     "FitWarning",
     "Impulse",
     "LinearityWarning",
-    "METHODS",
     "MasterEquation",
     "MasterFamily",
     "Method",
     "NormalModes",
     "Plan",
     "RunFolder",
-    "SOLVERS",
     "Scaling",
     "Scene",
     "SpectrumWarning",
