@@ -34,11 +34,9 @@ def other(tmp_path):
 
 
 def test_a_folder_in_use_is_refused_in_one_line_that_names_it_and_its_holder(other, tmp_path):
-    with pytest.raises(
-        FieldError, match=rf"out must be free, got .*/run, where process {other.pid} on .* is running"
-    ) as e:
-        with lock(tmp_path / "run", "out"):
-            pass
+    words = rf"out must be free, got .*/run, where process {other.pid} on .* is running"
+    with pytest.raises(FieldError, match=words) as e, lock(tmp_path / "run", "out"):
+        pass
     assert "\n" not in str(e.value)
     with lock(tmp_path / "run.1", "out"), lock(tmp_path / "ru", "out"):
         pass
@@ -58,10 +56,14 @@ def test_the_lock_of_a_dead_process_is_taken_over(other, tmp_path):
 
 
 def test_threads_of_one_process_meet_it_too_and_an_error_frees_it(tmp_path):
-    with pytest.raises(ZeroDivisionError), lock(tmp_path / "run", "out"):
-        with pytest.raises(FieldError, match="is running"), lock(tmp_path / "run", "out"):
-            pass
-        raise ZeroDivisionError
+    def failing():
+        with lock(tmp_path / "run", "out"):
+            with pytest.raises(FieldError, match="is running"), lock(tmp_path / "run", "out"):
+                pass
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        failing()
     with lock(tmp_path / "run", "out"):
         pass
 

@@ -33,6 +33,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.statistics import EnsembleMoments, joined
 from torchchain.locks import lock
+from torchchain.progress import log
 
 FORMAT = "torchchain-checkpoint-1"
 EVERY = 5.0
@@ -107,6 +108,8 @@ class Checkpoint:
             total.absorb(moments)
             names.append(part.path.name)
         self.resumed = sum(map(len, total.held()))
+        if self.resumed:
+            log.info(f"{self.resumed} of {realizations} realizations are in {self.folder}: going on from there")
         session = 1 + max((int(part.path.name[:5]) for part in parts), default=0)
         if len(names) > 1:
             self._merge(total, names, session, identity, plan)
@@ -215,12 +218,12 @@ class Writer:
         if moments.trees and (self.kept or self.checkpoint.resumed or self.due):
             self.save(moments)
 
-    def interrupted(self, moments: EnsembleMoments, realizations: int) -> Interrupted:
+    def interrupted(self, moments: EnsembleMoments) -> Interrupted:
         """Keep what is finished, if the run has lasted long enough to, and say what is kept."""
         self.close(moments)
         kept = self.checkpoint.resumed + self.kept
         words = (
-            f"interrupted: {kept} of {realizations} realizations are kept in {self.path.parent}, "
+            f"interrupted: {kept} of {moments.realizations} realizations are kept in {self.path.parent}, "
             "the same command goes on from there"
             if kept
             else "interrupted, nothing was written"
