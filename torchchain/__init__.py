@@ -12,6 +12,7 @@ from torchchain._version import __version__ as __version__
 
 _HOME = {
     "BandTransfer": "ensemble",
+    "Advance": "evolvers",
     "Chain": "chain",
     "Disorder": "chain",
     "Impulse": "chain",
@@ -20,6 +21,7 @@ _HOME = {
     "METHODS": "evolvers",
     "MasterEquation": "master",
     "MasterFamily": "master",
+    "Method": "evolvers",
     "MemoryModel": "master",
     "NormalModes": "modes",
     "Plan": "ensemble.plan",
@@ -56,6 +58,7 @@ _HOME = {
     "particle_energy": "energy",
     "plan": "master.coverage",
     "potential_energy": "energy",
+    "register_method": "evolvers",
     "simulate": "ensemble",
     "standing_wave": "chain",
     "statistical_distance": "ensemble.statistics",

@@ -291,6 +291,8 @@ METHOD = Method(
     stability="unconditional: the spectrum lies below a rigorous bound, and a bound that is too small is refused",
     cost="about W t / 2 stencils and 4 W sums of N numbers per unit of time (W: highest frequency); memory of a state",
     cannot="damping, Hertz contacts",
+    candidate=True,
+    compiled=True,
     options={
         "accuracy": "what truncation may leave out, relative to the size of the state, over 1024 segments (1e-12)",
         "bound": "squared frequency that no mode exceeds, a number or (*batch,); by default a rigorous one",

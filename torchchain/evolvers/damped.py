@@ -167,4 +167,6 @@ METHOD = Method(
     cannot="Hertz contacts, chains of more than some hundred particles; derivatives at degenerate eigenvalues "
     "(the ordered chain)",
     damped=True,
+    candidate=True,
+    matrices=48,
 )
