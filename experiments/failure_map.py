@@ -26,7 +26,7 @@ from torchchain import checks
 from torchchain.evolvers import chebyshev, ode, symplectic
 from torchchain.evolvers.symplectic4 import PEFRL
 from torchchain.evolvers.verlet import VERLET
-from torchchain.master.equation import Calibration
+from torchchain.master import Calibration
 from torchchain.master.solvers import ADAMS_ITERATIONS, ADAMS_STEPS, STABILITY
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps

@@ -85,7 +85,7 @@ def test_a_file_on_the_way_replaces_only_when_whole(tmp_path, monkeypatch):
     def dies(*arguments, **settings):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchchain.master.artifact.save_file", dies)
+    monkeypatch.setattr("torchchain.master.file.save_file", dies)
     with pytest.raises(KeyboardInterrupt):
         master(memory()).save(path)
     assert path.read_bytes() == before

@@ -13,7 +13,7 @@ import torch
 import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.evolvers.symplectic import MOST_STEPS
-from torchchain.master.calibration import Calibration
+from torchchain.master import Calibration
 from torchchain.master.equation import TrustWarning
 from torchchain.master.fits import FitWarning, nonlinear_rates
 from torchchain.modes.phase import PhaseWarning

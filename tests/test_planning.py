@@ -16,7 +16,7 @@ from torchchain.ensemble.machine import Machine
 from torchchain.ensemble.plan import forecast
 from torchchain.ensemble.reach import ReachExceeded, reach
 from torchchain.ensemble.scene import regular_times
-from torchchain.master.coverage import plan
+from torchchain.master.stand_in import plan
 
 TYPICAL = Machine(compilation=0.0, loading=0.0)
 

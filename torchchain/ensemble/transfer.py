@@ -86,6 +86,16 @@ class BandTransfer:
     def n_bands(self) -> int:
         return self.mean.shape[-1]
 
+    @property
+    def damping(self) -> float:
+        """Contact damping; 0 for data from elsewhere, whose shares of the energy are of that at each time."""
+        return 0.0 if self.scene is None else self.scene.damping
+
+    @property
+    def is_ordered(self) -> bool:
+        """Whether every realization is the same chain, so that there is no error of an ensemble."""
+        return self.scene is not None and self.scene.is_ordered
+
     def to_dataset(self) -> xarray.Dataset:
         """Labeled axes and units, for netCDF; :meth:`from_dataset` reads it back."""
         s, t, r, b = "source", "time", "receiver", "block"

@@ -135,7 +135,9 @@ def calibrate(
             report = replace(report, selection=selection)
         sample = Sample.of(transfer)
         fitted, told = asked.run(sample, near, shown.update)
-        report = replace(report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=replicates)
+        report = replace(
+            report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=replicates
+        )
         _check_growth(fitted, asked)
         if replicates:
             errors = draw_again(transfer, asked, fitted, replicates, shown.update)

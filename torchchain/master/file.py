@@ -6,13 +6,11 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy
-import scipy
 import torch
-import torchdiffeq
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
@@ -87,10 +85,7 @@ def _described(model: TransferModel, record: Calibration) -> dict[str, Any]:
         "conventions": CONVENTIONS,
         "versions": {
             "torchchain": __version__,
-            "torch": torch.__version__,
-            "numpy": numpy.__version__,
-            "scipy": scipy.__version__,
-            "torchdiffeq": torchdiffeq.__version__,
+            **{name: version(name) for name in ("torch", "numpy", "scipy", "torchdiffeq")},
         },
     }
 
@@ -193,9 +188,9 @@ def _headers(where: str, metadata: Mapping[str, str], expected: str) -> list[dic
 
 
 def _check_version(where: str, header: Mapping[str, Any]) -> None:
-    version = header.get("format_version")
-    if version != FORMAT_VERSION or isinstance(version, bool):
-        raise checks.fail(where, f"have format version {FORMAT_VERSION} (calibrate again for another)", version)
+    found = header.get("format_version")
+    if found != FORMAT_VERSION or isinstance(found, bool):
+        raise checks.fail(where, f"have format version {FORMAT_VERSION} (calibrate again for another)", found)
 
 
 def _header(where: str, header: Any) -> dict[str, Any]:

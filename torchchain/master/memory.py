@@ -14,7 +14,7 @@ from torchchain import checks
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import linear_weights
 from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping
-from torchchain.master.projection import NO_POLES, Order, Poles, Projection, search
+from torchchain.master.projection import Order, Poles, Projection, search
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.sample import Sample, block_weights, exact_basis, leading_vectors
 from torchchain.threads import single_blas_thread
@@ -156,7 +156,9 @@ class ProjectionSettings:
         if not isinstance(self.order, (tuple, list)) or len(self.order) != 2:
             raise checks.FieldTypeError(f"order must be two integers, got {checks.shown(self.order)}")
         object.__setattr__(
-            self, "order", (checks.integer("order", self.order[0], 1, 16), checks.integer("order", self.order[1], 0, 16))
+            self,
+            "order",
+            (checks.integer("order", self.order[0], 1, 16), checks.integer("order", self.order[1], 0, 16)),
         )
 
 
@@ -191,7 +193,7 @@ def fit_memory(
         mean: T [source, time, receiver].
         basis: Pi [source, receiver].
         order: number of exponentials (at least 1) and of pairs.
-        near: a model of similar data, to start from.
+        near: a model of similar data and the same order, to start from.
         leading: right singular vectors of the data, (entry, vector), where known.
         progress: called with 1 after every step.
 
@@ -203,16 +205,13 @@ def fit_memory(
     at_zero = (torch.eye(len(basis), dtype=basis.dtype) - basis).flatten().numpy()
     leading = leading_vectors(data) if leading is None else leading
     small = Projection(times.numpy(), data @ leading, at_zero @ leading)
-    poles, ended = search(small, order, _poles(near, order), progress)
+    poles, ended = search(small, order, None if near is None else _poles(near), progress)
     amplitudes, misfit, _ = Projection(times.numpy(), data, at_zero).amplitudes(poles)
     report = ProjectionReport(ended, float(np.sqrt(np.mean(misfit**2))), order)
     return _tensors(basis, poles, amplitudes, _conserved(mean, basis)), report
 
 
-def _poles(model: TransferModel | None, order: Order) -> Poles:
-    """The poles of a model where it has no more of them than the order."""
-    if not isinstance(model, MemoryModel) or len(model.decay) > order[0] or len(model.pair_decay) > order[1]:
-        return NO_POLES
+def _poles(model: MemoryModel) -> Poles:
     return Poles(model.decay.numpy(), model.pair_decay.numpy(), model.pair_frequency.numpy())
 
 
@@ -256,7 +255,7 @@ def replicas(transfer: BandTransfer, recipe: Recipe, model: MemoryModel, repeats
     block is reduced once, and each replica is fitted to a sum of rows.
     """
     sample, n = Sample.of(transfer), transfer.n_bands
-    poles = _poles(model, recipe.settings.order)
+    poles = _poles(model)
     times = sample.times.numpy()
     wanted = np.concatenate([poles.functions(times), poles.slopes(times), np.ones((len(times), 1))], axis=1)
     rows, _ = np.linalg.qr(wanted / np.linalg.norm(wanted, axis=0))

@@ -1,15 +1,13 @@
 """Variable projection: a few decay rates and frequencies shared by all pairs of bands, and their amplitudes.
 
 Golub and Pereyra, SIAM J. Numer. Anal. 10, 413 (1973), with the simplification of Kaufman, BIT 15, 49 (1975): for given
-rates the best amplitudes are a linear problem, so that only the few rates are searched for. The search grows function
-by function: the best one of a grid is added to those found, then all are polished together.
+rates the best amplitudes are a linear problem, so that only the few rates are searched for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,8 +16,9 @@ from scipy import optimize
 SLOWEST, FASTEST = 1e-4, 6.0
 """Decay rates and frequencies, per unit time."""
 SLOWEST_TURN = 1e-2
-FEW_STEPS, MANY_STEPS = 15, 150
-"""Of the search, after a function was added and at the end."""
+FEW_STEPS, MANY_STEPS = 40, 150
+"""Of the search, from every start and from the best of what they found."""
+RANDOM_STARTS = 3
 
 Order = tuple[int, int]
 """Numbers of exponentials and of pairs."""
@@ -48,12 +47,6 @@ class Poles:
     def of(cls, logarithms: np.ndarray, order: Order) -> Poles:
         return cls(*np.split(np.exp(logarithms), [order[0], sum(order)]))
 
-    def with_exponential(self, g: float) -> Poles:
-        return Poles(np.append(self.decay, g), self.pair_decay, self.pair_frequency)
-
-    def with_pair(self, g: float, w: float) -> Poles:
-        return Poles(self.decay, np.append(self.pair_decay, g), np.append(self.pair_frequency, w))
-
     def functions(self, times: np.ndarray) -> np.ndarray:
         """f_m at each time, (time, function): the exponentials, then cosine and sine of every pair."""
         t = times[:, None]
@@ -64,9 +57,6 @@ class Poles:
     def slopes(self, times: np.ndarray) -> np.ndarray:
         """t f_m at each time, (time, function), of which the derivatives to all rates and frequencies are sums."""
         return times[:, None] * self.functions(times)
-
-
-NO_POLES = Poles(np.empty(0), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,78 +117,39 @@ class Projection:
         )  # fmt: skip
         return Poles.of(found.x, order), float(found.cost), bool(found.success)
 
-    def grown(self, poles: Poles, order: Order) -> list[Poles]:
-        """The poles with one more function of each sort that the order lacks, the best of a grid."""
-        single, pairs = order[0] - len(poles.decay), order[1] - len(poles.pair_decay)
-        if not len(poles.decay):
-            g = min(self._decays, key=lambda g: float(np.square(self.amplitudes(poles.with_exponential(g))[1]).sum()))
-            return [poles.with_exponential(g)]
-        first = self._seen(poles.functions(self.times))[:, :1]
-        _, rest, left = self.amplitudes(poles)
-
-        def gain(columns: np.ndarray) -> np.ndarray:
-            """Squared misfit explained by each group of functions, from (row, group, member)."""
-            columns = columns - (left @ (left.T @ columns.reshape(len(columns), -1))).reshape(columns.shape)
-            product = np.einsum("tgm,tgn->gmn", columns, columns)
-            size = np.trace(product, axis1=1, axis2=2)[:, None, None]
-            part = np.einsum("tgm,te->gme", columns, rest, optimize=True)
-            best = np.linalg.solve(product + 1e-9 * size * np.eye(product.shape[-1]), part)
-            return np.sum(part * best, axis=(1, 2))
-
-        found = []
-        if single > 0:
-            found.append(poles.with_exponential(self._decays[int(gain(self._exponentials - first[:, :, None]).argmax())]))
-        if pairs > 0:
-            turning = self._turning - first[:, :, None] * np.array([1.0, 0.0])
-            for place in _peaks(gain(turning).reshape(len(self._decays), -1))[:3]:
-                found.append(poles.with_pair(self._decays[place[0]], self._frequencies[place[1]]))
-        return found
-
-    @cached_property
-    def _decays(self) -> np.ndarray:
-        return np.geomspace(max(2 * SLOWEST, 1 / self.times[-1]), 2.0, 14)
-
-    @cached_property
-    def _frequencies(self) -> np.ndarray:
-        return np.geomspace(0.03, 1.5, 18)
-
-    @cached_property
-    def _exponentials(self) -> np.ndarray:
-        """(row, exponential, 1)."""
-        return self._seen(np.exp(-np.outer(self.times, self._decays)))[:, :, None]
-
-    @cached_property
-    def _turning(self) -> np.ndarray:
-        """Cosine and sine of every decay rate and frequency, (row, pair, 2)."""
-        g, w = (x.ravel() for x in np.meshgrid(self._decays, self._frequencies, indexing="ij"))
-        both = Poles(np.empty(0), g, w).functions(self.times)
-        return self._seen(both).reshape(-1, len(g), 2)
-
 
 def _at_start(order: Order) -> np.ndarray:
     """f_m(0)."""
     return np.concatenate([np.ones(order[0]), np.tile([1.0, 0.0], order[1])])
 
 
-def _peaks(values: np.ndarray) -> list[tuple[int, int]]:
-    """Places of the values that no neighbor exceeds, the largest first."""
-    around = np.pad(values, 1, constant_values=-np.inf)
-    near = np.max([np.roll(around, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)[1:-1, 1:-1]
-    places = np.argwhere(values >= near)
-    return sorted(((int(i), int(j)) for i, j in places), key=lambda place: -values[place])
+def _starts(order: Order, end: float) -> Iterator[Poles]:
+    """Poles to start from: ladders of frequencies with as fast a decay and fast or slow exponentials, and random ones."""
+    single, pairs = order
+    for lowest, slow, fast in ((0.06, 0.3, 2.0), (0.02, 0.01, 1.0)):
+        frequency = np.geomspace(lowest, 0.3, pairs)
+        decay = np.geomspace(slow, fast, single) if single > 1 else np.array([fast / 2])
+        yield Poles(decay, frequency, frequency)
+    random = np.random.Generator(np.random.Philox(key=np.array(order, dtype=np.uint64)))
+    for _ in range(RANDOM_STARTS):
+        g = np.exp(random.uniform(np.log(max(2 * SLOWEST, 1 / end)), np.log(1.5), single + pairs))
+        yield Poles(g[:single], g[single:], np.exp(random.uniform(np.log(0.03), 0.0, pairs)))
 
 
-def search(problem: Projection, order: Order, near: Poles = NO_POLES, progress: Callable[[int], Any] | None = None) -> tuple[Poles, bool]:
-    """The poles of an order: those nearby polished, or grown function by function from them; deterministic.
+def search(
+    problem: Projection, order: Order, near: Poles | None = None, progress: Callable[[int], Any] | None = None
+) -> tuple[Poles, bool]:
+    """The poles of an order with the least misfit: near those given, or from several starts; deterministic.
 
     Returns:
         The poles, and whether the last search ended by itself.
     """
-    poles = near
-    while poles.order != order:
-        tries = [problem.polished(other, FEW_STEPS) for other in problem.grown(poles, order)]
-        poles = min(tries, key=lambda found: found[1])[0]
-        if progress is not None:
-            progress(1)
-    poles, _, ended = problem.polished(poles, MANY_STEPS)
+    if near is None or near.order != order:
+        tries = []
+        for start in _starts(order, float(problem.times[-1])):
+            tries.append(problem.polished(start, FEW_STEPS))
+            if progress is not None:
+                progress(1)
+        near = min(tries, key=lambda found: found[1])[0]
+    poles, _, ended = problem.polished(near, MANY_STEPS)
     return poles, ended

@@ -217,7 +217,9 @@ FITS = (
 )  # fmt: skip
 
 
-def _record(name: str, summary: str, basis: Callable[[Sample], Tensor], extra: Callable[[int], int], **needs: Any) -> ReducedModel:
+def _record(
+    name: str, summary: str, basis: Callable[[Sample], Tensor], extra: Callable[[int], int], **needs: Any
+) -> ReducedModel:
     """The record of a model with rates, which has ``extra(n_bands)`` numbers beside Q."""
     return ReducedModel(
         name, summary, **{"kind": RateModel, **needs}, fits=FITS, usual="adam", climbed_by="linear", basis=basis,
@@ -225,8 +227,12 @@ def _record(name: str, summary: str, basis: Callable[[Sample], Tensor], extra: C
     )  # fmt: skip
 
 
-PAPER = _record("paper", "rates Q, basis energy Psi of Eq. 47", samples.paper_basis, lambda n: 0, needs_strength=True, default=True)
-EXACT_PSI = _record("exact_psi", "Psi from the exact long-time average", samples.exact_psi, lambda n: n, needs_long_time=True)
+PAPER = _record(
+    "paper", "rates Q, basis energy Psi of Eq. 47", samples.paper_basis, lambda n: 0, needs_strength=True, default=True
+)
+EXACT_PSI = _record(
+    "exact_psi", "Psi from the exact long-time average", samples.exact_psi, lambda n: n, needs_long_time=True
+)
 BASIS_MATRIX = _record(
     "basis_matrix", "basis energy of every pair of bands, Pi[s, r]", samples.exact_basis, lambda n: n**2,
     needs_long_time=True, default=True,

@@ -37,7 +37,9 @@ def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
     return [recipe for _, recipe in sorted(found, key=lambda entry: entry[0])]
 
 
-def select(transfer: BandTransfer, asked: Recipe, progress: Progress = None) -> tuple[Recipe, Selection, TransferModel | None]:
+def select(
+    transfer: BandTransfer, asked: Recipe, progress: Progress = None
+) -> tuple[Recipe, Selection, TransferModel | None]:
     """The first rung that, fitted on every other block, predicts the rest as well as the fitted blocks' means do.
 
     As well: within 5 % in total variation. If none does, the nearest. Models with rates are tried with procedure L.
@@ -56,16 +58,19 @@ def select(transfer: BandTransfer, asked: Recipe, progress: Progress = None) -> 
     tried: list[Rung] = []
     models: list[TransferModel] = []
     for candidate in candidates:
-        near = next((m for m, r in zip(reversed(models), reversed(tried), strict=True) if r.model == candidate.model.name), None)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FitWarning)
-            model, _ = candidate.run(seen, near, progress)
+            model, _ = candidate.run(seen, progress=progress)
         distance = float(total_variation(model.transfer(transfer.times).detach(), held)[:, used].mean())
         tried.append(Rung(candidate.model.name, candidate.order, distance))
         models.append(model)
         if distance <= ENOUGH * noise:
             break
-    best = len(tried) - 1 if tried[-1].distance <= ENOUGH * noise else min(range(len(tried)), key=lambda i: tried[i].distance)
+    best = (
+        len(tried) - 1
+        if tried[-1].distance <= ENOUGH * noise
+        else min(range(len(tried)), key=lambda i: tried[i].distance)
+    )
     reached = "reaches" if tried[best].distance <= ENOUGH * noise else "comes nearest to"
     reason = f"smallest model that {reached} the distance of the two halves of the ensemble"
     return candidates[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best]

@@ -64,6 +64,19 @@ class Uncertainty:
         size = initial.abs().amax(-1, keepdim=True).clamp(min=torch.finfo(initial.dtype).tiny)
         return torch.einsum("...s,str->...tr", (initial / size).square(), here.square()).sqrt() * size[..., None]
 
+    def coarsened(self, joined: Tensor) -> Uncertainty:
+        """Of wider bands, which ``joined`` (band, wider band) makes of the present ones.
+
+        Errors of sources are independent, as in :meth:`of`. Those of receivers may be the same error of the model, and
+        add up: the standard errors are upper bounds.
+        """
+        mean = (joined / joined.sum(0)).T.square()
+
+        def wider(error: Tensor) -> Tensor:
+            return torch.tensordot(mean, (error @ joined).square(), dims=1).sqrt()
+
+        return Uncertainty(wider(self.rates_stderr), wider(self.basis_stderr), self.times, wider(self.stderr))
+
     def tensors(self) -> dict[str, Tensor]:
         return {
             "rates_stderr": self.rates_stderr, "basis_stderr": self.basis_stderr,
@@ -130,9 +143,7 @@ def draw_again(
     )
 
 
-def _replicas(
-    transfer: BandTransfer, recipe: Recipe, model: TransferModel, repeats: Tensor
-) -> Iterator[TransferModel]:
+def _replicas(transfer: BandTransfer, recipe: Recipe, model: TransferModel, repeats: Tensor) -> Iterator[TransferModel]:
     """The models of ensembles in which blocks are repeated, (replica, block): the record's own way, or fitted anew."""
     if recipe.model is not None and recipe.model.replicas is not None:
         yield from recipe.model.replicas(transfer, recipe, model, repeats)
