@@ -122,15 +122,15 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
     rows: list[tuple[str, Any]] = [
         (
             "model",
-            f"{master.calibration.model}, fitted by {master.calibration.method}, {master.model.n_parameters} parameters",
+            f"{master.calibration.model}, fitted by {master.calibration.method}, {master.n_parameters} parameters",
         ),
         *([("conservation defect", master.model.conservation_defect)] if transfer.scene.damping == 0 else []),
         ("lowest predicted share of energy", float(predicted.min())),
     ]
     report = master.calibration.report
-    if "selection" in report:
-        rows.insert(1, ("chosen", report["selection"]))
-    if "damping" in report:
+    if report.selection is not None:
+        rows.insert(1, ("chosen", report.selection.reason))
+    if report.loss is not None:
         lost = 1 - transfer.mean.sum(-1)
         rows.append(
             (

@@ -146,6 +146,9 @@ def _solver(integrator: Integrator) -> Solver:
     return Solver(name, _ode(integrator), "torchdiffeq, fixed step", options)
 
 
+STABILITY = {entry.name: stability_limit(entry) for entry in INTEGRATORS.values() if not entry.adaptive}
+"""Largest |lambda| step of every method with a fixed step."""
+
 SOLVERS: dict[str, Solver] = {
     "expm": Solver("expm", expm, "matrix exponential, exact"),
     **{name: _solver(integrator) for name, integrator in INTEGRATORS.items()},
