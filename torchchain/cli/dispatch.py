@@ -12,7 +12,7 @@ from torchchain.cli.predict import run_predict
 from torchchain.cli.rerun import rerun
 from torchchain.cli.runs import config_of, scene_of, threads_for
 from torchchain.cli.simulate import run_simulate
-from torchchain.master.coverage import plan
+from torchchain.master.stand_in import plan
 
 
 def run(flags: Any, arguments: list[str]) -> int:
