@@ -21,12 +21,13 @@ from torchchain.ensemble import plan as planning
 from torchchain.ensemble.scene import describe
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer, band_transfer
-from torchchain.master import MasterEquation, calibrate
+from torchchain.master import Calibration, MasterEquation, calibrate
 from torchchain.master.calibration import recipe
 from torchchain.master.ladder import methods
 from torchchain.master.paper_rates import paper_rates
 from torchchain.progress import log
 from torchchain.results import read_transfer
+
 
 def run_calibrate(
     flags: Calibrate, arguments: list[str], options: dict[str, Any] | None = None, keep: bool = True
@@ -88,7 +89,7 @@ def _leave(
         log.info("drawing and writing")
         with stages("figure"):
             figure = calibration_figure(transfer, master, predicted)
-    done = master.calibration
+    done = fitted(master)
     chosen = {**settings, "method": done.method, "model": done.model, "window": list(done.window or ())}
     scene = [] if transfer.scene is None or "transfer" in source else [transfer.scene.to_toml()]
     seed = None if transfer.scene is None else transfer.scene.seed
@@ -110,6 +111,12 @@ def _leave(
     print(f"{time.time() - run.began:.1f} s, results in {run.flags.out}")
 
 
+def fitted(master: MasterEquation) -> Calibration:
+    """How the model came to be, which :func:`calibrate` always tells."""
+    assert master.calibration is not None
+    return master.calibration
+
+
 def title(transfer: BandTransfer) -> str:
     """Where the transfer is from, in one line."""
     if transfer.scene is not None:
@@ -125,7 +132,7 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
     end = float(transfer.times[-1])
     late = transfer.times > end / 2
     early = ~late & (transfer.times > 0)
-    done = master.calibration
+    done = fitted(master)
     rows: list[tuple[str, Any]] = [
         ("model", f"{done.model}, fitted by {done.method}, {master.n_parameters} parameters"),
         *([("chosen", done.report.selection.reason)] if done.report.selection is not None else []),
@@ -172,7 +179,8 @@ def calibration_figure(transfer: BandTransfer, master: MasterEquation, predicted
     ax.plot(bands, rates.sum(-1) - rates.diagonal(), "-", label=r"$\sum_{r \neq s} Q_{sr}$")
     ax.set(xlabel="source s", ylabel="rate", title="conservation")
     ax.legend(fontsize="small")
-    figure.suptitle(f"{title(transfer)}; model {master.calibration.model}, {master.calibration.method}")
+    done = fitted(master)
+    figure.suptitle(f"{title(transfer)}; model {done.model}, {done.method}")
     return figure
 
 
@@ -184,4 +192,8 @@ def _rates(transfer: BandTransfer, master: MasterEquation) -> tuple[np.ndarray, 
         return master.rates.detach().numpy(), None, master.rates_meaning
     error = found["rates_stderr"].values.diagonal()
     window = " to ".join(f"{time:g}" for time in found.attrs["window"])
-    return found["rates"].values, error if np.isfinite(error).all() else None, f"the paper's Q, procedure L, t = {window}"
+    return (
+        found["rates"].values,
+        error if np.isfinite(error).all() else None,
+        f"the paper's Q, procedure L, t = {window}",
+    )
