@@ -15,7 +15,7 @@ from torchchain.ensemble.moving_part import PartExceeded, moving_part
 from torchchain.ensemble.plan import forecast
 from torchchain.ensemble.scene import regular_times
 from torchchain.evolvers import start
-from torchchain.master.coverage import plan
+from torchchain.master.stand_in import plan
 
 
 def scene(**fields):

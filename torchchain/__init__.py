@@ -22,7 +22,7 @@ def _names() -> tuple[list[str], dict[str, tuple[str, str]]]:
         if isinstance(entry, ast.ImportFrom) and entry.module:
             homes |= {name.asname or name.name: (entry.module, name.name) for name in entry.names}
         elif isinstance(entry, ast.Assign):
-            shown = ast.literal_eval(entry.value)
+            shown = sorted(ast.literal_eval(entry.value))
     return shown, homes
 
 

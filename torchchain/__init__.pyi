@@ -33,6 +33,7 @@ from torchchain.energy import wavenumber_energy_matrix as wavenumber_energy_matr
 from torchchain.energy import zero_wavenumber_share as zero_wavenumber_share
 from torchchain.ensemble import BandTransfer as BandTransfer
 from torchchain.ensemble import Observable as Observable
+from torchchain.ensemble import Provenance as Provenance
 from torchchain.ensemble import Scene as Scene
 from torchchain.ensemble import band_transfer as band_transfer
 from torchchain.ensemble import register_observable as register_observable
@@ -40,6 +41,7 @@ from torchchain.ensemble import simulate as simulate
 from torchchain.ensemble.checkpoint import Checkpoint as Checkpoint
 from torchchain.ensemble.checkpoint import CheckpointWarning as CheckpointWarning
 from torchchain.ensemble.fused import energy_moments as energy_moments
+from torchchain.ensemble.observables import OBSERVABLES as OBSERVABLES
 from torchchain.ensemble.plan import Plan as Plan
 from torchchain.ensemble.statistics import statistical_distance as statistical_distance
 from torchchain.ensemble.statistics import total_variation as total_variation
@@ -48,14 +50,20 @@ from torchchain.evolvers import Advance as Advance
 from torchchain.evolvers import Method as Method
 from torchchain.evolvers import evolve as evolve
 from torchchain.evolvers import register_method as register_method
+from torchchain.master import MODELS as MODELS
 from torchchain.master import SOLVERS as SOLVERS
 from torchchain.master import Calibration as Calibration
 from torchchain.master import ChapmanKolmogorov as ChapmanKolmogorov
+from torchchain.master import Fit as Fit
+from torchchain.master import FitWarning as FitWarning
 from torchchain.master import IntegrationError as IntegrationError
 from torchchain.master import MasterEquation as MasterEquation
 from torchchain.master import MasterFamily as MasterFamily
 from torchchain.master import MemoryModel as MemoryModel
 from torchchain.master import RateModel as RateModel
+from torchchain.master import Recipe as Recipe
+from torchchain.master import ReducedModel as ReducedModel
+from torchchain.master import Report as Report
 from torchchain.master import SwingInModel as SwingInModel
 from torchchain.master import TransferModel as TransferModel
 from torchchain.master import TrustWarning as TrustWarning
@@ -64,8 +72,9 @@ from torchchain.master import calibrate as calibrate
 from torchchain.master import calibrate_family as calibrate_family
 from torchchain.master import chapman_kolmogorov as chapman_kolmogorov
 from torchchain.master import implied_timescales as implied_timescales
-from torchchain.master.coverage import plan as plan
-from torchchain.master.fits import FitWarning as FitWarning
+from torchchain.master import paper_rates as paper_rates
+from torchchain.master import register_model as register_model
+from torchchain.master.stand_in import plan as plan
 from torchchain.modes import DecompositionError as DecompositionError
 from torchchain.modes import NormalModes as NormalModes
 from torchchain.modes import SpectrumWarning as SpectrumWarning
@@ -80,6 +89,8 @@ from torchchain.results import open_folder as open
 
 __all__ = [
     "METHODS",
+    "MODELS",
+    "OBSERVABLES",
     "SOLVERS",
     "BandTransfer",
     "Chain",
@@ -96,6 +107,7 @@ __all__ = [
     "NormalModes",
     "Observable",
     "Plan",
+    "ReducedModel",
     "RunFolder",
     "Scaling",
     "Scene",
@@ -116,9 +128,11 @@ __all__ = [
     "long_time_band_energy",
     "normal_modes",
     "open",
+    "paper_rates",
     "particle_energy",
     "plan",
     "register_method",
+    "register_model",
     "register_observable",
     "simulate",
     "standing_wave",

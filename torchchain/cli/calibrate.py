@@ -21,14 +21,12 @@ from torchchain.ensemble import plan as planning
 from torchchain.ensemble.scene import describe
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer, band_transfer
-from torchchain.master import MasterEquation, calibrate
+from torchchain.master import Calibration, MasterEquation, calibrate
 from torchchain.master.calibration import recipe
+from torchchain.master.ladder import methods
+from torchchain.master.paper_rates import paper_rates
 from torchchain.progress import log
 from torchchain.results import read_transfer
-
-SETTINGS = (
-    "method", "model", "window", "constraint", "penalty", "steps", "learning_rate", "tolerance", "order", "bootstrap",
-)  # fmt: skip
 
 
 def run_calibrate(
@@ -45,7 +43,7 @@ def run_calibrate(
         for name in {**config, **flags.overrides()}:
             raise checks.fail(name, "not be given together with transfer, which is of a scene already", repr(name))
         path, transfer = read_transfer(flags.transfer)
-        recipe(transfer.scene, **settings, long_time=transfer.long_time is not None)
+        recipe(transfer, **settings)
         with running(flags, arguments, loaded, options, keep=False) as run:
             source = {"transfer": {"path": str(path.resolve()), "sha256": outputs.sha256(path)}}
             _leave(run, transfer, settings, None, source)
@@ -55,6 +53,7 @@ def run_calibrate(
     with running(flags, arguments, loaded, options, keep) as run:
         found = run.measured(band_transfer, scene)
         if found is not None:
+            assert found.scene is not None, "of a simulation"
             measured = replace(found.scene, observables=("band_energy", "long_time_band_energy"))
             forecast = planning.forecast(measured, found.attributes, run.spent, float(found.stderr.max()))
             _leave(run, found, settings, forecast, run.how(found.attributes))
@@ -65,7 +64,8 @@ def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:
     if not isinstance(table, Mapping):
         raise checks.FieldTypeError(f"calibration must be a table, got {checks.shown(table)}")
     settings = merged_tables(table, flags.calibration())
-    checks.known_keys("calibration", settings, SETTINGS)
+    fits = [name for fit in methods().values() for name in fit.settings_names]
+    checks.known_keys("calibration", settings, ("method", "model", "window", "bootstrap", *dict.fromkeys(fits)))
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])
@@ -89,17 +89,18 @@ def _leave(
         log.info("drawing and writing")
         with stages("figure"):
             figure = calibration_figure(transfer, master, predicted)
-    done = master.calibration
+    done = fitted(master)
     chosen = {**settings, "method": done.method, "model": done.model, "window": list(done.window or ())}
-    scene = [] if "transfer" in source else [transfer.scene.to_toml()]
+    scene = [] if transfer.scene is None or "transfer" in source else [transfer.scene.to_toml()]
+    seed = None if transfer.scene is None else transfer.scene.seed
     files = {
         "transfer.nc": outputs.dataset(transfer.to_dataset()),
         "model.safetensors": master.save,
         "figure.png": outputs.figure(figure),
     }
     config = run.config(*scene, tomli_w.dumps({"calibration": chosen}))
-    run.write(files, config, seed=transfer.scene.seed, **source, forecast=forecast, summary=dict(rows))
-    print(describe(transfer.scene))
+    run.write(files, config, seed=seed, **source, forecast=forecast, summary=dict(rows))
+    print(title(transfer))
     run.told(forecast)
     for warning in caught:
         print(f"warning: {warning.message}")
@@ -110,6 +111,20 @@ def _leave(
     print(f"{time.time() - run.began:.1f} s, results in {run.flags.out}")
 
 
+def fitted(master: MasterEquation) -> Calibration:
+    """How the model came to be, which :func:`calibrate` always tells."""
+    assert master.calibration is not None
+    return master.calibration
+
+
+def title(transfer: BandTransfer) -> str:
+    """Where the transfer is from, in one line."""
+    if transfer.scene is not None:
+        return describe(transfer.scene)
+    words = transfer.provenance.words if transfer.provenance is not None else ""
+    return f"{words or 'band transfer'}, {transfer.n_bands} bands, {len(transfer.times)} times"
+
+
 def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.Tensor) -> list[tuple[str, Any]]:
     """The table of a calibration: what the model is, how far it is from its ensemble, and the ensemble's own error."""
     distance = total_variation(predicted, transfer.mean)
@@ -117,14 +132,14 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
     end = float(transfer.times[-1])
     late = transfer.times > end / 2
     early = ~late & (transfer.times > 0)
-    done = master.calibration
+    done = fitted(master)
     rows: list[tuple[str, Any]] = [
-        ("model", f"{done.model}, fitted by {done.method}, {master.model.n_parameters} parameters"),
-        *([("chosen", done.report["selection"])] if "selection" in done.report else []),
-        *([("conservation defect", master.model.conservation_defect)] if transfer.scene.damping == 0 else []),
+        ("model", f"{done.model}, fitted by {done.method}, {master.n_parameters} parameters"),
+        *([("chosen", done.report.selection.reason)] if done.report.selection is not None else []),
+        *([("conservation defect", master.model.conservation_defect)] if transfer.damping == 0 else []),
         ("lowest predicted share of energy", float(predicted.min())),
     ]
-    if "damping" in done.report:
+    if done.report.loss is not None:
         lost = transfer.mean.sum(-1) - predicted.sum(-1)
         rows.append(("energy lost: root mean square error of the prediction", float(lost.square().mean().sqrt())))
     compared = "infinite time" if master.horizon == math.inf else f"t = {master.horizon:g}"
@@ -135,8 +150,9 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
         rows.append((f"total variation to the ensemble, {end / 2:g} < t <= {end:g}", float(distance[:, late].mean())))
         mean = float(statistical[:, transfer.times > 0].mean())
         rows.append(("statistical error: total variation of two such ensembles", mean))
-    realized = "{mass_mean:.5f}, {mass_sd:.5f}".format(**transfer.attributes)
-    rows.append(("masses: realized mean, standard deviation", realized))
+    if "mass_mean" in transfer.attributes:
+        realized = "{mass_mean:.5f}, {mass_sd:.5f}".format(**transfer.attributes)
+        rows.append(("masses: realized mean, standard deviation", realized))
     return rows
 
 
@@ -153,15 +169,31 @@ def calibration_figure(transfer: BandTransfer, master: MasterEquation, predicted
         other = max(1, source - 3)
         pairs = list(dict.fromkeys([(source, source), (source, other)]))
         plots.decay_comparison(axes[row, 2], times, mean, stderr, model, pairs, f"source band {source}")
-    plots.rate_map(axes[2, 0], master.rates.detach().numpy(), "rates Q (diagonal: loss)")
+    rates, error, meaning = _rates(transfer, master)
+    plots.rate_map(axes[2, 0], rates, f"{meaning} (diagonal: loss)")
     distance, noise = total_variation(predicted, transfer.mean), statistical_distance(transfer.stderr)
     plots.distance_curve(axes[2, 1], times, distance.numpy(), noise.numpy(), "distance of model and ensemble")
     ax = axes[2, 2]
     bands = np.arange(1, n + 1)
-    ax.plot(bands, -master.rates.detach().diagonal().numpy(), "o", label="loss rate $-Q_{ss}$")
-    off = master.rates.detach() - torch.diag(master.rates.detach().diagonal())
-    ax.plot(bands, off.sum(-1).numpy(), "-", label=r"$\sum_{r \neq s} Q_{sr}$")
+    ax.errorbar(bands, -rates.diagonal(), error, fmt="o", label="loss rate $-Q_{ss}$")
+    ax.plot(bands, rates.sum(-1) - rates.diagonal(), "-", label=r"$\sum_{r \neq s} Q_{sr}$")
     ax.set(xlabel="source s", ylabel="rate", title="conservation")
     ax.legend(fontsize="small")
-    figure.suptitle(f"{describe(transfer.scene)}; model {master.calibration.model}, {master.calibration.method}")
+    done = fitted(master)
+    figure.suptitle(f"{title(transfer)}; model {done.model}, {done.method}")
     return figure
+
+
+def _rates(transfer: BandTransfer, master: MasterEquation) -> tuple[np.ndarray, np.ndarray | None, str]:
+    """The paper's Q of the ensemble, the standard error of its diagonal, and its name; where it has none, the model's."""
+    try:
+        found = paper_rates(transfer)
+    except checks.FieldError:  # too few times early on, or an unknown disorder
+        return master.rates.detach().numpy(), None, master.rates_meaning
+    error = found["rates_stderr"].values.diagonal()
+    window = " to ".join(f"{time:g}" for time in found.attrs["window"])
+    return (
+        found["rates"].values,
+        error if np.isfinite(error).all() else None,
+        f"the paper's Q, procedure L, t = {window}",
+    )

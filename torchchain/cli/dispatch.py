@@ -14,7 +14,7 @@ from torchchain.cli.rerun import rerun
 from torchchain.cli.runs import config_of, scene_of, threads_for
 from torchchain.cli.simulate import run_simulate
 from torchchain.cli.sweep import run_sweep
-from torchchain.master.coverage import plan
+from torchchain.master.stand_in import plan
 
 
 def run(flags: Any, arguments: list[str]) -> int:

@@ -122,6 +122,8 @@ def _dataset(
     axes, units = ("start", "time", "band"), {"units": "energy of the start"}
     clock = {"units": "travel time of sound over one particle", "long_name": "time t"}
     bands = np.arange(1, master.n_bands + 1)
+    told = master.calibration
+    origin = "" if told is None else told.provenance if told.scene is None else told.scene.to_toml()
     variables = {"band_energy": (axes, energy.numpy(), {**units, "long_name": "energy in a band"})}
     if master.uncertainty is not None:
         error = master.standard_error(starts, times).cpu().numpy()
@@ -137,7 +139,7 @@ def _dataset(
             "time": ("time", times.numpy(), clock),
             "band": ("band", bands, {"long_name": plots.BAND_LABEL}),
         },
-        attrs={"model": path.name, "calibrated_on": master.calibration.scene.to_toml()},
+        attrs={"model": path.name, "calibrated_on": origin},
     )
 
 
