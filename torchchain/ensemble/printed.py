@@ -6,7 +6,7 @@ from html import escape
 
 
 class Printed:
-    """A record that says of itself what :meth:`_rows` holds, under its class's name."""
+    """A record that says of itself what :meth:`_rows` holds, name by name, in one line or several, under its class."""
 
     def _rows(self) -> dict[str, str]:
         raise NotImplementedError
@@ -14,8 +14,16 @@ class Printed:
     def __repr__(self) -> str:
         rows = self._rows()
         width = max(map(len, rows))
-        return "\n".join([type(self).__name__, *(f"  {name:<{width}}  {words}" for name, words in rows.items())])
+        further = "\n" + " " * (width + 4)
+        lines = (f"  {name:<{width}}  {words}".replace("\n", further) for name, words in rows.items())
+        return "\n".join([type(self).__name__, *lines])
 
     def _repr_html_(self) -> str:
-        rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(w)}</td></tr>" for name, w in self._rows().items())
+        rows = "".join(
+            f"<tr><th>{escape(name)}</th><td>{_html(words)}</td></tr>" for name, words in self._rows().items()
+        )
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
+
+
+def _html(words: str) -> str:
+    return escape(words).replace("\n", "<br>")
