@@ -138,7 +138,9 @@ def test_leaving_energy_falls_as_the_square_of_a_weak_disorder():
 @pytest.fixture(scope="module")
 def chains():
     """Rings that did not enter the measurement of the enhanced return."""
-    scene = tc.Scene(n_particles=64, n_bands=8, disorder=tc.Disorder(strength=0.2), times=TIMES, realizations=400, seed=5)
+    scene = tc.Scene(
+        n_particles=64, n_bands=8, disorder=tc.Disorder(strength=0.2), times=TIMES, realizations=400, seed=5
+    )
     return tc.band_transfer(scene)
 
 
@@ -155,7 +157,9 @@ def test_transfer_is_that_of_chains(chains):
 def test_localization_is_what_the_ladder_lacks_at_late_times(chains):
     disorder = tc.Disorder(strength=0.2)
     whole, ladder = (theory_transfer(disorder, 64, 8, TIMES, localization=x) for x in (True, False))
-    assert float(distance(whole.long_time, chains.long_time)) < 0.4 * float(distance(ladder.long_time, chains.long_time))
+    assert float(distance(whole.long_time, chains.long_time)) < 0.4 * float(
+        distance(ladder.long_time, chains.long_time)
+    )
     assert float(distance(whole.mean, chains.mean)[-1]) < 0.6 * float(distance(ladder.mean, chains.mean)[-1])
 
 

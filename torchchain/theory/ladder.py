@@ -84,9 +84,7 @@ class Stretch:
     points: int
 
 
-def stretches(
-    last: float, edges: tuple[float, float], decay: float = DECAY, momentum: bool = False
-) -> list[Stretch]:
+def stretches(last: float, edges: tuple[float, float], decay: float = DECAY, momentum: bool = False) -> list[Stretch]:
     """Stretches that cover times up to ``last`` for a spectrum with these :func:`spectrum_edges`."""
     found: list[Stretch] = []
     start, stop = 0.0, min(FIRST, last) or FIRST
@@ -151,7 +149,9 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
     differences = 2 * stretch.step * torch.arange(points, dtype=torch.float64)
     low_pass = torch.ones(points, dtype=torch.complex128)
     if stretch.start >= _LATE:  # a Gaussian average of the energy itself: the whole complex difference
-        low_pass = torch.exp(-(torch.complex(differences, torch.full_like(right, 2 * stretch.eta)) * _AVERAGE).square() / 2)
+        low_pass = torch.exp(
+            -(torch.complex(differences, torch.full_like(right, 2 * stretch.eta)) * _AVERAGE).square() / 2
+        )
     used = max(1, int((low_pass.abs() > 1e-9).sum()))
     low_pass[1:] *= 2
     growth = torch.exp(2 * stretch.eta * times)
@@ -185,7 +185,9 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
     energy_in_time *= growth[:, None]
     area = 2 * stretch.step**2 / (2 * math.pi) ** 2
     scale = _source_scale(law, waves) * area
-    spread = energy_in_time.reshape(len(times), len(waves.sources), waves.n_bands).transpose(0, 1) * scale[:, None, None]
+    spread = (
+        energy_in_time.reshape(len(times), len(waves.sources), waves.n_bands).transpose(0, 1) * scale[:, None, None]
+    )
     rows = torch.arange(len(waves.sources))
     spread[rows, :, waves.source_bands] += coherent
     return spread
@@ -204,7 +206,9 @@ def _mirrored(values: Tensor, sign: int = 1) -> Tensor:
 def _window(z: Tensor, stretch: Stretch) -> Tensor:
     """1 on the spectrum, smoothly 0 beyond: in time a kernel narrower than the stretch's distance from 0."""
     at = z.numpy()
-    return torch.from_numpy((special.erf((at + stretch.cut) / stretch.smooth) - special.erf((at - stretch.cut) / stretch.smooth)) / 2)
+    return torch.from_numpy(
+        (special.erf((at + stretch.cut) / stretch.smooth) - special.erf((at - stretch.cut) / stretch.smooth)) / 2
+    )
 
 
 def _received(waves: Waves, argument: Tensor) -> Tensor:

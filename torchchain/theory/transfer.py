@@ -88,6 +88,7 @@ def theory_transfer(
         FieldError: for what the theory does not hold for.
 
     Example:
+        >>> from torchchain import Disorder
         >>> result = theory_transfer(Disorder(strength=0.2), 64, 8, [0.0, 1.0, 10.0])
         >>> result.mean.shape
         torch.Size([8, 3, 8])
@@ -115,7 +116,9 @@ def theory_transfer(
             earlier = onset(2 * times, spectrum, numbers)
             left = torch.exp(-damping * spectrum.nodes.square()[:, None] * times)
             change = (came * left).T @ pattern.T
-            error[s] = _SHAPE_ERROR * _distance(change) + _ONSET_ERROR * _distance(((earlier - came) * left).T @ pattern.T)
+            error[s] = _SHAPE_ERROR * _distance(change) + _ONSET_ERROR * _distance(
+                ((earlier - came) * left).T @ pattern.T
+            )
             if localization:
                 mean[s] += change
             else:
@@ -124,7 +127,11 @@ def theory_transfer(
                 final = pattern.sum(-1)
                 long_time[s] = plain + final if localization else plain
                 long_error[s] = (_SHAPE_ERROR if localization else 1.0) * _distance(final)
-    settings = {"edge": edges[0], "closure": closure, "stretches": stretches(float(times[-1]), edges, decay, waves.momentum)}
+    settings = {
+        "edge": edges[0],
+        "closure": closure,
+        "stretches": stretches(float(times[-1]), edges, decay, waves.momentum),
+    }
     return TheoryTransfer(times, mean, long_time, error, long_error, settings)
 
 
