@@ -5,7 +5,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.theory import fit_disorder
+from torchchain.theory import fit_disorder, theory_transfer
 
 TIMES = torch.arange(0, 31, 3, dtype=torch.float64)
 TONE, BAND = 22, 5
@@ -33,8 +33,6 @@ def test_strength_and_damping_together():
 
 
 def test_a_transfer_of_its_own_is_recovered():
-    from torchchain.theory import theory_transfer
-
     exact = theory_transfer(tc.Disorder(strength=0.25), 32, 4, TIMES).mean
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(6, *exact.shape, generator=generator, dtype=torch.float64) * 1e-3

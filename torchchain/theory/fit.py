@@ -75,11 +75,13 @@ def fit_disorder(
         FieldError: for energies of another shape, or fewer than 2 realizations.
 
     Example:
-        >>> chain = Chain(Disorder(strength=0.2).masses(64, 10, seed=1))
-        >>> state = standing_wave(chain, tone=22)
-        >>> times = torch.arange(0.0, 30.0)
-        >>> curve = band_energy(chain, evolve(chain, state, times), 8)[..., 5]
-        >>> fit_disorder(times, curve, 64, 8, tones=[22]).strength
+        >>> import torch, torchchain as tc
+        >>> chain = tc.Chain(tc.Disorder(strength=0.2).masses(64, 40, seed=1))
+        >>> times = torch.arange(0.0, 30.0, 3.0)
+        >>> motion = tc.evolve(chain, tc.standing_wave(chain, tone=22), times)
+        >>> fit = fit_disorder(times, tc.band_energy(chain, motion, 8)[..., 5], 64, 8, tones=[22])
+        >>> abs(fit.strength - 0.2) < 2 * fit.strength_stderr
+        True
     """
     times = checks.times("times", times)
     measured = checks.real_tensor("energies", energies)

@@ -59,6 +59,7 @@ def law_of(disorder: Disorder, nodes: int = 48) -> Law:
         nodes: of the short rule; fewer where the law has fewer values (a binary law has two).
 
     Example:
+        >>> from torchchain import Disorder
         >>> law = law_of(Disorder(strength=0.1))
         >>> round(law.variance, 6)
         0.01

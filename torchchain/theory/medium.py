@@ -76,9 +76,10 @@ def effective_medium(
         FieldError: for frequencies that are not positive.
 
     Example:
+        >>> from torchchain import Disorder
         >>> medium = effective_medium(Disorder(strength=0.3), [0.5, 1.0, 1.5])
         >>> [round(x, 1) for x in medium.mean_free_path.tolist()]
-        [164.8, 30.5, 7.6]
+        [84.6, 17.3, 4.8]
     """
     checks.instance("disorder", disorder, Disorder)
     w = checks.real_tensor("frequencies", frequencies).to(torch.float64)

@@ -87,6 +87,7 @@ def theory_transfer(
         FieldError: for what the theory does not hold for.
 
     Example:
+        >>> from torchchain import Disorder
         >>> result = theory_transfer(Disorder(strength=0.2), 64, 8, [0.0, 1.0, 10.0])
         >>> result.mean.shape
         torch.Size([8, 3, 8])
