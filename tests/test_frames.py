@@ -776,6 +776,20 @@ def test_positions_of_too_few_digits(columns, file):
     warned("coarse.dump, frame 6: x: positions of . digits", frames.scaled(units).trajectory)
 
 
+def test_a_box_of_six_digits_that_is_crossed(file):
+    """As LIGGGHTS writes its bounds; a box of few digits is a round number, one of many is not rounded."""
+    chain, path = made(amplitude=1e-4)
+    own = path.displacement[:, 3]
+    for side, doubtful in ((10.0, False), (10.1234, True), (10.123412345, False)):
+        shift = side - 3.5 - float(own.min() + own.max()) / 2  # the fourth particle goes to and fro across the bound
+        frames = read_frames(file(dump(chain, path, "id mass x vx", shift=shift, side=side), "crossed.dump"))
+        if doubtful:
+            found = warned("crossed.dump, frame 6: box: the bound 10.1234 along x has six digits", frames.trajectory)
+        else:
+            found = frames.trajectory()
+        assert (found.displacement - (path.displacement - path.displacement[0])).abs().max() < 1e-13 * SIDE
+
+
 def test_motion_across_the_chain(motion, file):
     chain, path = motion
     frames = read_frames(file(dump(chain, path, "id mass xu y vx vy", values={"vy": [0.01] * N})))

@@ -70,6 +70,23 @@ def check_digits(name: str, frame: Frame, axes: list[str], moved: Tensor, length
                 return
 
 
+def check_bounds(name: str, frame: Frame, axis: str, moved: Tensor, length: float) -> None:
+    """A warning where particles crossed a box whose bounds are rounded to six digits, as LIGGGHTS writes them."""
+    if frame.box is None:
+        return
+    size, i = float(moved.square().mean().sqrt()) * length, AXES.index(axis)
+    for bound in (frame.box.lower[i] * length, frame.box.upper[i] * length):
+        # Fewer digits are a round number, more are not rounded.
+        if f"{bound:.6g}" == f"{bound:.12g}" != f"{bound:.5g}":
+            error = 0.5 * 10.0 ** (math.floor(math.log10(abs(bound))) - 5)
+            if error > NOISE * size:
+                warn(
+                    f"{here(name, frame)}: box",
+                    f"the bound {bound / length:.6g} along {axis} has six digits: if it is rounded, displacements beyond it are off by up to {error / size:.1g} of their size {size / length:.2g} (dump {axis}u)",
+                )
+                return
+
+
 def check_across(name: str, frame: Frame, axis: str) -> None:
     """A warning for motion across the axis of a chain."""
     if frame.velocities is None or len(frame.axes) < 2:

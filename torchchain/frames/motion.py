@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.states import Trajectory
-from torchchain.frames.doubts import check_across, check_digits, here, warn
+from torchchain.frames.doubts import check_across, check_bounds, check_digits, here, warn
 from torchchain.frames.order import check_contact_order, line_axis, line_order
 from torchchain.frames.record import AXES, Box, Frame
 from torchchain.memory import gigabytes, memory
@@ -49,7 +49,7 @@ def displacements(
         for c in columns
     ]
     before = torch.zeros_like(rest)
-    last, numbers = first, []
+    last, numbers, crossed = first, [], set[int]()
     for k, frame in enumerate(frames):
         if frame.velocities is None:
             raise checks.fail(
@@ -67,13 +67,18 @@ def displacements(
         for i, (column, side) in enumerate(zip(columns, wraps, strict=True)):
             if side:
                 _check_box(name, frame, reference, first.axes[column])
-                u[:, i] -= side * ((u[:, i] - before[:, i]) / side).round()
+                turns = ((u[:, i] - before[:, i]) / side).round()
+                u[:, i] -= side * turns
+                if bool(turns.any()):
+                    crossed.add(column)
             elif frame.box is not None and not frame.unwrapped[column]:
                 _check_jump(name, frame, u[:, i], first.axes[column])
         times[k], moved[k], velocity[k], before = frame.time, u, frame.velocities[order][:, columns], u
         last = frame
         numbers.append(frame.number)
     check_digits(name, last, [first.axes[c] for c in columns], moved, length)
+    for column in sorted(crossed):
+        check_bounds(name, last, first.axes[column], moved, length)
     if line is not None:
         _check_line(name, numbers, moved[..., 0], first, reference, order, line)
         check_across(name, last, line)
