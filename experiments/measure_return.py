@@ -16,7 +16,7 @@ from scipy.optimize import minimize, minimize_scalar
 from torch import Tensor
 
 import torchchain as tc
-from torchchain.bands import center_tones
+from torchchain.energy.bands import center_tones
 from torchchain.theory import MEASURED, Return, law_of
 from torchchain.theory.ladder import Waves, ladder_transfer, spectrum_edges
 from torchchain.theory.localized import Frequencies, interference, onset, source_frequencies

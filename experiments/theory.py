@@ -18,7 +18,7 @@ from torch import Tensor
 
 import torchchain as tc
 from torchchain import plots
-from torchchain.bands import band_of, center_tones
+from torchchain.energy.bands import band_of, center_tones
 from torchchain.master.fits import analytic_prefactor, linear_rates, profile
 from torchchain.theory import born_rates, effective_medium, theory_transfer
 

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import State
-from torchchain.evolvers.method import Advance, Method
+from torchchain.chain import Advance, Method, State
 from torchchain.network.modes import NetworkModes, normal_modes
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import NetworkTrajectory
