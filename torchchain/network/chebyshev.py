@@ -22,10 +22,11 @@ from scipy.sparse import coo_matrix, csgraph
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import Advance, Method, State
+from torchchain.chain import State
 from torchchain.evolvers.chebyshev import check_work
 from torchchain.evolvers.coefficients import coefficients_of
 from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS
+from torchchain.evolvers.method import Advance, Method
 from torchchain.network.lattices import PRIMITIVE, STEPS, Lattice
 from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from torchchain import checks
-from torchchain.chain import Advance, Method, State
+from torchchain.chain import State
 from torchchain.chain.states import Trajectory
+from torchchain.evolvers.method import Advance, Method
 from torchchain.network import chebyshev, damped, modal, verlet
 from torchchain.network.networks import Network
 

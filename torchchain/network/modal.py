@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import Advance, Method, State
+from torchchain.chain import State
+from torchchain.evolvers.method import Advance, Method
 from torchchain.network.modes import NetworkModes, normal_modes
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import NetworkTrajectory
