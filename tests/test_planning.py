@@ -8,7 +8,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.cli.entry import main
+from torchchain.cli import main
 from torchchain.ensemble import layout
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.moving_part import PartExceeded, moving_part

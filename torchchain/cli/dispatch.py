@@ -6,12 +6,14 @@ from typing import Any
 
 from torchchain.cli import plugins
 from torchchain.cli.calibrate import run_calibrate
+from torchchain.cli.compare import run_compare
 from torchchain.cli.family import run_family
-from torchchain.cli.flags import Calibrate, Family, Plan, Predict, Rerun, Simulate
+from torchchain.cli.flags import Calibrate, Compare, Family, Plan, Predict, Rerun, Simulate, Sweep
 from torchchain.cli.predict import run_predict
 from torchchain.cli.rerun import rerun
 from torchchain.cli.runs import config_of, scene_of, threads_for
 from torchchain.cli.simulate import run_simulate
+from torchchain.cli.sweep import run_sweep
 from torchchain.master.stand_in import plan
 
 
@@ -28,6 +30,11 @@ def run(flags: Any, arguments: list[str]) -> int:
             run_calibrate(flags, arguments)
     elif isinstance(flags, Predict):
         run_predict(flags, arguments)
+    elif isinstance(flags, Compare):
+        run_compare(flags, arguments)
+    elif isinstance(flags, Sweep):
+        with threads_for(flags.threads):
+            run_sweep(flags, arguments)
     elif isinstance(flags, Family):
         plugins.load(())
         run_family(flags, arguments)

@@ -218,8 +218,43 @@ class Rerun:
     """threads of this process"""
 
 
+@dataclass(frozen=True)
+class Compare:
+    """How two results differ, in units of their standard errors: z-scores, total variation, settings, figure."""
+
+    a: Annotated[str, tyro.conf.Positional, flag("FILE|FOLDER")]
+    """results.nc or transfer.nc, or the folder of a run"""
+    b: Annotated[str, tyro.conf.Positional, flag("FILE|FOLDER")]
+    """the other"""
+    out: Annotated[str, flag("FOLDER", "results/compare")] = "results/compare"
+    """for figure.png and run.json"""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The same command at every combination of values of some fields; goes on where it was stopped."""
+
+    command: Annotated[str, tyro.conf.Positional, flag(("simulate", "calibrate"))]
+    """what to run"""
+    fields: Annotated[tuple[str, ...], tyro.conf.Positional, flag("FIELD=V1,V2 ...")]
+    """fields of the scene file and their values, as in disorder.strength=0.1,0.3 n_particles=128,256"""
+    config: Annotated[str | None, flag("FILE")] = None
+    """scene file (TOML) that holds all other fields"""
+    seed: Annotated[int | None, flag("INT", 0)] = None
+    """seed of every ensemble"""
+    out: Annotated[str, flag("FOLDER", "results/sweep")] = "results/sweep"
+    """for sweep.nc, sweep.csv, figure.png, run.json, and the folder of every run in runs"""
+    device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
+    """cpu, cuda, cuda:1, ..."""
+    threads: Annotated[int | None, flag("INT", "all cores, shared by the processes that torchrun starts")] = None
+    """threads of this process"""
+    plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()
+    """registers observables, methods or models of its own; repeatable"""
+
+
 COMMANDS: dict[str, Any] = {
     "simulate": Simulate, "calibrate": Calibrate, "predict": Predict, "family": Family, "plan": Plan, "rerun": Rerun,
+    "compare": Compare, "sweep": Sweep,
 }  # fmt: skip
 
 

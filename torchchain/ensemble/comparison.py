@@ -92,7 +92,7 @@ def _difference(a: xarray.Dataset, b: xarray.Dataset, variable: str) -> tuple[xa
     first, second = xarray.align(_with_error(a, variable), _with_error(b, variable), join="inner")
     if first["value"].size == 0:
         raise checks.fail(f"{variable} of both results", "have coordinates in common", "none")
-    return first["value"] - second["value"], np.sqrt(first["error"] ** 2 + second["error"] ** 2)
+    return first["value"] - second["value"], (first["error"] ** 2 + second["error"] ** 2) ** 0.5
 
 
 def _with_error(data: xarray.Dataset, variable: str) -> xarray.Dataset:
