@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 
 import torchchain as tc
 from torchchain.master.adam import CONSTRAINTS
-from torchchain.master.ladder import fitted_by, methods
 from torchchain.master.fits import FitWarning
+from torchchain.master.ladder import fitted_by, methods
 
 
 @dataclass(frozen=True)

@@ -117,24 +117,24 @@ def run(scene: tc.Scene, choice: Choice) -> xarray.Dataset:
 def timed(
     scene: tc.Scene, choices: list[Choice], repeats: int, within: float
 ) -> dict[str, tuple[float, xarray.Dataset]]:
-    """Median seconds and result of each way, taken in turn, so that a slow spell of the machine meets them all.
+    """Median processor time and result of each way, taken in turn, so that a slow spell of the machine meets them all.
 
     A way that took more than twice as many times the fastest as is good is not repeated: nothing hangs on it.
     """
     spent: dict[str, list[float]] = {}
     results = {}
     for choice in choices:
-        begin = time.perf_counter()
+        begin = time.process_time()
         results[way_of(choice)] = run(scene, choice)
-        spent[way_of(choice)] = [time.perf_counter() - begin]
+        spent[way_of(choice)] = [time.process_time() - begin]
     for _ in range(repeats):
         for choice in choices:
             samples = spent[way_of(choice)]
             if samples[-1] > 2 * within * min(map(min, spent.values())) and samples[-1] > 0.05:
                 continue
-            begin = time.perf_counter()
+            begin = time.process_time()
             run(scene, choice)
-            samples.append(time.perf_counter() - begin)
+            samples.append(time.process_time() - begin)
     return {name: (float(np.median(s[1:] or s)), results[name]) for name, s in spent.items()}
 
 

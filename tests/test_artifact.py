@@ -375,7 +375,9 @@ def test_places_that_cannot_be_written(tmp_path):
 
 def test_a_report_that_json_cannot_hold(tmp_path):
     spoiled = master(markov())
-    spoiled.calibration = replace(spoiled.calibration, report=Report(fit=AdamReport(True, 1, np.inf, 1.0, "exact", 0.0)))
+    spoiled.calibration = replace(
+        spoiled.calibration, report=Report(fit=AdamReport(True, 1, np.inf, 1.0, "exact", 0.0))
+    )
     with pytest.raises(FieldError, match="report must hold finite numbers"):
         spoiled.save(tmp_path / "x.safetensors")
     assert os.listdir(tmp_path) == []

@@ -270,7 +270,9 @@ def test_projection_chooses_an_order():
     transfer = transfer_of(mean, long_time=basis, noise=0.01)
     master = tc.calibrate(transfer)
     assert master.calibration.report.fit.order == (1, 1)
-    assert master.calibration.report.selection.tried[1] == Rung("memory", (1, 0), master.calibration.report.selection.tried[1].distance)
+    assert master.calibration.report.selection.tried[1] == Rung(
+        "memory", (1, 0), master.calibration.report.selection.tried[1].distance
+    )
     again = tc.calibrate(transfer)
     assert torch.equal(again.model.amplitudes, master.model.amplitudes)
 

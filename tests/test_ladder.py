@@ -146,7 +146,9 @@ def test_rungs_come_in_order_of_their_size(small_transfer):
     sizes = []
     for rung in rungs(asked, small_transfer):
         extra = {"order": rung.order} if rung.order else {}
-        sizes.append(tc.calibrate(small_transfer, rung.fit.name, rung.model.name, bootstrap=0, **extra).model.n_parameters)
+        sizes.append(
+            tc.calibrate(small_transfer, rung.fit.name, rung.model.name, bootstrap=0, **extra).model.n_parameters
+        )
     plain = [size for size in sizes if size > small_transfer.n_bands**2]  # a diagonal basis is not counted by the model
     assert plain == sorted(plain)
     assert len(sizes) == len(rungs(asked, small_transfer)) >= 5

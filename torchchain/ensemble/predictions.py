@@ -69,15 +69,16 @@ class Facts:
     def accumulated(self) -> float:
         """What leaving out the nonlinearity of Hertz contacts does to energies by the last time.
 
-        The force is off by ``deviation``, and phases by that share of w t while the elongation lasts. A pulse spreads:
-        its elongation starts at about half and falls as t^(-1/3), the front's, down to what disorder localizes.
+        The force is off by ``deviation``, and phases by half of that times w t while the elongation lasts. A pulse
+        spreads: its elongation starts at about half and falls as t^(-1/3), the front's, down to what disorder localizes,
+        and no particle has more than a tenth of its energy again.
         """
         w = min(self.frequency(1), self.typical)
         lasting = self.end
         if self.impulse:
             kinds = self.scene.disorder, self.scene.stiffness_disorder
             localized = min(1.0, max(kind.strength for kind in kinds if kind is not None))
-            lasting = 0.5 * max(1.5 * ((1 + self.end) ** (2 / 3) - 1), localized * self.end)
+            lasting = 0.05 * max(1.5 * ((1 + self.end) ** (2 / 3) - 1), localized * self.end)
         return self.deviation * (1 + 0.5 * w * lasting)
 
     def frequency(self, power: int) -> float:

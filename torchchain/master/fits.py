@@ -64,8 +64,9 @@ def linear_rates(times: Tensor, mean: Tensor, free: Tensor, window: tuple[float,
     Returns:
         Q [source, receiver]. Rows sum to zero to rounding, because the energies sum to 1 at every time.
     """
-    slope = torch.einsum("t,str->sr", linear_weights(times, window), mean)
-    return slope / free[:, None]
+    inside = within(times, window, 2)
+    change = mean[:, inside] - mean[:, inside][:, :1]  # exactly zero where nothing moves, whatever the free share
+    return torch.einsum("t,str->sr", linear_weights(times, window)[inside], change) / free[:, None]
 
 
 def linear_weights(times: Tensor, window: tuple[float, float]) -> Tensor:

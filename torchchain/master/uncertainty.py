@@ -182,5 +182,8 @@ def horizon(transfer: BandTransfer, model: TransferModel) -> float:
     noise = 2 * float(statistical_distance(transfer.stderr[:, late]).mean())
     settled = float(total_variation(transfer.mean[:, late], transfer.long_time[:, None]).mean())
     latest = torch.tensor([end, 100 * end], dtype=transfer.times.dtype)
-    ahead = float(total_variation(model.transfer(latest)[:, -1].detach(), transfer.long_time).mean())
+    foreseen = model.transfer(latest)[:, -1].detach()
+    if not bool(foreseen.isfinite().all()):
+        return end
+    ahead = float(total_variation(foreseen, transfer.long_time).mean())
     return math.inf if settled <= noise and ahead <= noise else end
