@@ -106,9 +106,9 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 
 def each_realization_of_ring(scene: tc.Scene, device: str) -> dict[str, Tensor]:
     """Band energies over time and their infinite-time average, of every ring, from its modes."""
-    parts: dict[str, list[Tensor]] = {"band_energy": [], "long_time": []}
+    parts: dict[str, list[Tensor]] = {"band_energy": [], "long_time_band_energy": []}
     measured = ensemble.stream(
-        scene, lambda chunk: {**chunk.observe(["band_energy"]), "long_time": chunk.long_time()}, "modes", device=device
+        scene, lambda chunk: chunk.observe(["band_energy", "long_time_band_energy"]), "modes", device=device
     )
     for _, values in measured:
         for name, part in parts.items():

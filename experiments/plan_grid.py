@@ -18,13 +18,14 @@ from matplotlib.figure import Figure
 import torchchain as tc
 from torchchain import checks
 from torchchain.ensemble import plan as planning
-from torchchain.ensemble.machine import Machine, this_machine
 from torchchain.ensemble.plan import Choice
-from torchchain.ensemble.predictions import Facts, error_of, seconds, settle
+from torchchain.ensemble.predictions import Facts, cost, error_of, settle
 from torchchain.ensemble.scene import describe, regular_times
+from torchchain.evolvers import METHODS
 
 IN_SPACE = ("center", "width", "energy", "displacement", "total_energy", "source_energy")
 LAWS = ("linear",) * 12 + ("damped",) * 3 + ("hertz",) * 4 + ("hertz damped",)
+STIFFNESS = (None, tc.Disorder("gamma", 1.0), None, tc.Disorder("lognormal", 0.9), None)  # of the scenes, by twenties
 WAYS = (
     "modes", "tridiagonal", "chebyshev", "verlet", "verlet float32", "symplectic4", "symplectic4 float32", "damped",
     "dopri8",
@@ -62,6 +63,7 @@ def varied(config: Config, number: int) -> tc.Scene:
     n = 2 * round(2 ** draw.uniform(4, min(largest, 7) if damping else largest))  # no faster reference for long ones
     boundary = str(draw.choice(["periodic", "fixed"]))
     strength = float(draw.choice([0.0, 0.1, 0.3, 0.5], p=[0.1, 0.3, 0.3, 0.3]))
+    stiffness = STIFFNESS[number // len(LAWS) % len(STIFFNESS)]
     end = 10 ** draw.uniform(1, 3.7 if law == "linear" else 2.2)
     count = int(draw.choice([1, 8, int(2 ** draw.uniform(5, 9))]))
     tolerance = draw.choice([1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 0.0])
@@ -88,16 +90,16 @@ def varied(config: Config, number: int) -> tc.Scene:
         n_particles=n, boundary=boundary, disorder=tc.Disorder(strength=strength), excitation=excitation,
         times=torch.tensor([end]) if count == 1 else regular_times(0.0, end, end / (count - 1)), n_bands=n_bands,
         realizations=realizations, seed=config.seed, tolerance=float(tolerance) or None, observables=names,
-        contact="hertz" if hertz else "linear", damping=damping,
+        contact="hertz" if hertz else "linear", damping=damping, stiffness_disorder=stiffness,
     )  # fmt: skip
 
 
-def reachable(scene: tc.Scene, machine: Machine) -> tc.Scene:
+def reachable(scene: tc.Scene) -> tc.Scene:
     """The scene with its tolerance ten times looser, and again, where no method reaches it."""
     try:
-        planning.plan(scene, machine)
+        planning.plan(scene)
     except checks.FieldError:
-        return reachable(replace(scene, tolerance=10 * scene.tolerance), machine)
+        return reachable(replace(scene, tolerance=10 * scene.tolerance))
     return scene
 
 
@@ -136,17 +138,18 @@ def timed(
     return {name: (float(np.median(s[1:] or s)), results[name]) for name, s in spent.items()}
 
 
-def references(scene: tc.Scene, machine: Machine) -> dict[str, Choice]:
+def references(scene: tc.Scene) -> dict[str, Choice]:
     """For each family of methods another one, at the tightest accuracy that is worth it, to measure its error by."""
     facts = Facts(scene)
     tolerance = (scene.tolerance or planning.plan(scene).tolerance) / 10
 
     def tight(method: str, **options: float) -> Choice:
         found = options or settle(method, facts, tolerance, torch.float64)[0]
-        if method not in planning.CANDIDATES:
-            return Choice(method, found, tolerance, 0.0, tolerance)
+        if not METHODS[method].candidate:
+            return Choice(method, found, tolerance, 0.0, 0.0, tolerance)
         off = error_of(method, facts, found, torch.float64)
-        return Choice(method, found, off, seconds(method, facts, found, torch.float64, machine), tolerance)
+        work = facts.chains * cost(method, facts, found, torch.float64, facts.chains)
+        return Choice(method, found, off, work, work * planning.speed(), tolerance)
 
     if scene.damping == 0 and scene.contact == "linear":
         by_matrix = "modes" if scene.boundary == "periodic" else "tridiagonal"
@@ -169,11 +172,10 @@ def error(found: xarray.Dataset, exact: xarray.Dataset, names: tuple[str, ...]) 
 
 def measure(config: Config, device: str) -> xarray.Dataset:
     if device != "cpu":
-        raise checks.fail("device", "be 'cpu', whose speeds the plan knows", repr(device))
-    machine = this_machine()
+        raise checks.fail("device", "be 'cpu', whose costs the plan knows", repr(device))
     for number in range(min(config.scenes, len(LAWS))):  # load and compile what the methods use
         small = varied(replace(config, longest=0.05, work=1e-6), number)
-        for choice in planning.plan(small, machine).choices:
+        for choice in planning.plan(small).choices:
             if choice.good and choice.predicted_seconds < 1:
                 run(small, choice)
     shape = (config.scenes, len(WAYS))
@@ -183,9 +185,9 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     }
     chosen, tolerances, words, plan_seconds = [], [], [], []
     for i in range(config.scenes):
-        scene = reachable(varied(config, i), machine)
+        scene = reachable(varied(config, i))
         begin = time.perf_counter()
-        plan = planning.plan(scene, machine)
+        plan = planning.plan(scene)
         plan_seconds.append(time.perf_counter() - begin)
         fastest = min(choice.predicted_seconds for choice in plan.choices)
         for choice in plan.choices:
@@ -200,7 +202,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             if choice.good and choice.predicted_seconds <= max(config.patience, 10 * fastest)
         ]
         exact: dict[str, xarray.Dataset] = {}
-        by = references(scene, machine)
+        by = references(scene)
         for name, (spent, result) in timed(scene, run_now, config.repeats, config.within).items():
             reference = by.get(name.partition(" ")[0], by[""])
             if reference.method not in exact:

@@ -9,9 +9,7 @@ import torchchain as tc
 from torchchain import cli
 from torchchain.checks import FieldError
 from torchchain.ensemble import footprint
-from torchchain.ensemble.observables import IN_TIME
 
-AXES = {name: entry.axes for name, entry in IN_TIME.items()}
 LONG = torch.arange(10**7, dtype=torch.float64) / 1e6
 
 
@@ -83,9 +81,9 @@ def test_what_fits_is_not_refused():
 
 
 def test_an_estimate_is_what_the_tensors_hold():
-    scene = tc.Scene(n_particles=32, n_bands=4, realizations=3, times=[0.0, 1.0, 2.0])
     names = ("band_energy", "energy", "center", "wavenumber_energy")
-    one = footprint.footprint(scene, "modes", False, names, AXES)
+    scene = tc.Scene(n_particles=32, n_bands=4, realizations=3, times=[0.0, 1.0, 2.0], observables=names)
+    one = footprint.footprint(scene, "modes", False)
     found = tc.simulate(
         tc.Scene(n_particles=32, n_bands=4, realizations=1, times=[0.0, 1.0, 2.0], observables=names), "modes"
     )

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.ensemble.machine import Machine
 from torchchain.evolvers import ode
 from torchchain.evolvers.drift import EnergyDriftError
 from torchchain.master import IntegrationError
@@ -84,7 +83,6 @@ def memory():
 EYE = torch.eye(4, dtype=torch.float64)
 START = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 ENERGY = torch.tensor([[0.1, 0.2, 0.3, 0.1]], dtype=torch.float64)
-MACHINE = Machine()
 TIMES = [0.0, 1.0, 2.0]
 
 
@@ -163,7 +161,7 @@ CALLS = {
     "lyapunov_exponent": Call(tc.lyapunov_exponent, {"disorder": tc.Disorder(), "frequencies": [0.5], "n_particles": 8, "realizations": 2, "seed": 0, "stiffness_disorder": None}),
     "normal_modes": Call(tc.normal_modes, lambda: {"chain": chain()}),
     "particle_energy": Call(tc.particle_energy, lambda: {"chain": chain(), "trajectory": trajectory(), "definition": "bond"}),
-    "plan": Call(tc.plan, lambda: {"scene": scene(), "machine": MACHINE, "artifact": None}, {"artifact": ("file",)}, infinite=True),
+    "plan": Call(tc.plan, lambda: {"scene": scene(), "artifact": None}, {"artifact": ("file",)}, infinite=True),
     "potential_energy": Call(tc.potential_energy, lambda: {"chain": chain(), "trajectory": trajectory(), "definition": "site"}),
     "simulate": Call(tc.simulate, lambda: {"scene": scene(realizations=2), "method": "modes", **RUN, "checkpoint": None}),
     "standing_wave": Call(tc.standing_wave, lambda: {"chain": chain(), "tone": 1, "amplitude": 0.01, "phase": "sin"}),

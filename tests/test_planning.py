@@ -8,17 +8,13 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.cli.entry import main
-from torchchain.ensemble import machine
+from torchchain.cli import main
+from torchchain.ensemble import layout
 from torchchain.ensemble import plan as planning
-from torchchain.ensemble import run as ensemble
-from torchchain.ensemble.machine import Machine
+from torchchain.ensemble.moving_part import PartExceeded, moving_part
 from torchchain.ensemble.plan import forecast
-from torchchain.ensemble.reach import ReachExceeded, reach
 from torchchain.ensemble.scene import regular_times
 from torchchain.master.coverage import plan
-
-TYPICAL = Machine(compilation=0.0, loading=0.0)
 
 
 def scene(**fields):
@@ -40,7 +36,7 @@ def scene(**fields):
     ],
 )
 def test_only_methods_that_can_treat_the_scene(fields, methods):
-    found = plan(scene(**fields), TYPICAL)
+    found = plan(scene(**fields))
     assert {found.method, *(other.method for other in found.runners_up)} == methods
 
 
@@ -49,7 +45,7 @@ def test_only_methods_that_can_treat_the_scene(fields, methods):
 def test_error_of_a_planned_step_is_within_the_tolerance(tolerance, method):
     """The step that the plan would give, against the exact modes: energies per particle relative to the largest."""
     wanted = scene(tolerance=tolerance)
-    planned = plan(wanted, TYPICAL)
+    planned = plan(wanted)
     choices = {choice.method: choice for choice in planned.runners_up} | {planned.method: planned}
     chain = wanted.chain(range(4))
     start = wanted.state(chain)
@@ -74,15 +70,15 @@ WHOLE = {"excitation": tc.StandingWave(tones=(7,)), "observables": ("energy",), 
     ],
 )
 def test_clear_cut_scenes(fields, method):
-    assert plan(scene(**fields), TYPICAL).method == method
+    assert plan(scene(**fields)).method == method
 
 
 def test_a_cold_kernel_is_not_compiled_for_a_small_job():
-    assert plan(scene(), Machine()).method in ("modes", "tridiagonal")
+    assert plan(scene()).method in ("modes", "tridiagonal")
 
 
 def test_float32_only_where_the_tolerance_allows_it():
-    loose, tight = (plan(scene(n_particles=512, contact="hertz", tolerance=t), TYPICAL) for t in (1e-2, 1e-9))
+    loose, tight = (plan(scene(n_particles=512, contact="hertz", tolerance=t)) for t in (1e-2, 1e-9))
     assert loose.dtype == torch.float32
     assert loose.run_options["dtype"] == "float32"
     assert tight.dtype == torch.float64
@@ -97,7 +93,7 @@ def test_float32_as_chosen_keeps_to_the_tolerance():
         observables=("energy",),
         excitation=tc.Impulse(site=200, velocity=0.3),
     )
-    chosen = plan(wanted, TYPICAL)
+    chosen = plan(wanted)
     assert chosen.dtype == torch.float32
     found = tc.simulate(wanted, chosen.method, options=chosen.run_options).energy
     exact = tc.simulate(wanted, "verlet", options={"step": 0.004}).energy
@@ -117,7 +113,7 @@ VARIED = [
 def test_predicted_errors_are_bounds(fields, tolerance):
     """Every way that the plan lists, against another exact one."""
     wanted = scene(**fields, tolerance=tolerance)
-    for choice in plan(wanted, TYPICAL).choices:
+    for choice in plan(wanted).choices:
         options = {**choice.options, **({"dtype": "float32"} if choice.dtype == torch.float32 else {})}
         if not choice.good or options.get("step", 1.0) < 1e-3:
             continue
@@ -129,7 +125,7 @@ def test_predicted_errors_are_bounds(fields, tolerance):
 
 
 def test_without_a_tolerance_the_ensemble_sets_it():
-    few, many = (plan(scene(realizations=r), TYPICAL) for r in (4, 400))
+    few, many = (plan(scene(realizations=r)) for r in (4, 400))
     assert few.tolerance == pytest.approx(10 * many.tolerance)
     assert "ensemble's own error" in few.reasons[0]
 
@@ -147,7 +143,7 @@ def test_without_a_tolerance_the_method_adds_little_to_the_error_of_the_ensemble
 
 def test_impossible_tolerance_is_refused_with_the_reachable_one():
     with pytest.raises(FieldError, match=r"tolerance must be at least .* method"):
-        plan(scene(tolerance=1e-15), TYPICAL)
+        plan(scene(tolerance=1e-15))
 
 
 def test_auto_gives_what_the_plan_names():
@@ -162,17 +158,8 @@ def test_auto_gives_what_the_plan_names():
     )
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"flop": -1}', '{"version": 2, "flop": "fast"}', '{"bogus": 1}'])
-def test_a_spoiled_machine_record_is_measured_again(tmp_path, monkeypatch, content):
-    monkeypatch.setenv("TORCHCHAIN_CACHE", str(tmp_path))
-    monkeypatch.setattr(machine, "measure", lambda: TYPICAL)
-    (tmp_path / "machine.json").write_text(content)
-    assert machine.this_machine() == TYPICAL
-    assert Machine(**json.loads((tmp_path / "machine.json").read_text())) == TYPICAL
-
-
 def test_plan_prints_its_reasons_and_runners_up():
-    text = str(plan(scene(), TYPICAL))
+    text = str(plan(scene()))
     for word in ("method", "tolerance", "error", "time", "because", "runner-up"):
         assert word in text
 
@@ -182,7 +169,7 @@ def test_contact_law_follows_the_amplitude(velocity, law):
     wanted = scene(
         contact="auto", tolerance=1e-2, excitation=tc.Impulse(site=20, velocity=velocity), observables=("energy",)
     )
-    planned = plan(wanted, TYPICAL)
+    planned = plan(wanted)
     assert planned.scene.contact == planning.resolved(wanted).contact == law
     assert law in planned.reasons[1].lower()
     if law == "linear":  # the contact that was left out would have made no more difference than was allowed
@@ -207,11 +194,11 @@ def test_the_part_that_a_wave_reaches_gives_what_the_whole_chain_does(boundary, 
         n_particles=400, boundary=boundary, contact=contact, observables=every, times=torch.arange(0.0, 31.0, 5.0),
         excitation=tc.Impulse(site=230, velocity=0.2),
     )  # fmt: skip
-    part = reach(wanted)
+    part = moving_part(wanted)
     assert part is not None
     assert part.size < 200
     cut = tc.simulate(wanted, "symplectic4", options={"step": 0.2})
-    monkeypatch.setattr(ensemble, "reach", lambda scene: None)
+    monkeypatch.setattr(layout, "moving_part", lambda scene, method: None)
     whole = tc.simulate(wanted, "symplectic4", options={"step": 0.2})
     for name in every:
         scale = float(abs(whole[name]).max())
@@ -221,23 +208,23 @@ def test_the_part_that_a_wave_reaches_gives_what_the_whole_chain_does(boundary, 
 
 def test_a_wave_that_leaves_its_part_is_computed_on_the_whole_chain(monkeypatch):
     wanted = scene(n_particles=400, times=torch.tensor([30.0]), excitation=tc.Impulse(site=200))
-    part = reach(wanted)
+    part = moving_part(wanted)
     short = replace(part, first=190, last=211)
     chain = short.chain(wanted.chain([0]))
-    with pytest.raises(ReachExceeded):
+    with pytest.raises(PartExceeded):
         short.check(chain, tc.evolve(chain, short.state(wanted.state(wanted.chain([0]))), [30.0]))
     expected = tc.simulate(wanted, "modes")
-    monkeypatch.setattr(ensemble, "reach", lambda scene: short)
+    monkeypatch.setattr(layout, "moving_part", lambda scene, method: short)
     found = tc.simulate(wanted, "modes")
     assert float(found.center[0]) == pytest.approx(float(expected.center[0]), rel=1e-12)
 
 
 def test_bands_rings_struck_at_the_seam_and_late_times_need_the_whole_chain():
     fields = {"n_particles": 400, "times": torch.tensor([30.0]), "excitation": tc.Impulse(site=200)}
-    assert reach(scene(**fields)) is not None
-    assert reach(scene(**{**fields, "excitation": tc.Impulse(site=1), "boundary": "periodic"})) is None
-    assert reach(scene(**{**fields, "times": torch.tensor([1000.0])})) is None
-    assert reach(scene(**{**fields, "observables": ("wavenumber_energy",)})) is None
+    assert moving_part(scene(**fields)) is not None
+    assert moving_part(scene(**{**fields, "excitation": tc.Impulse(site=1), "boundary": "periodic"})) is None
+    assert moving_part(scene(**{**fields, "times": torch.tensor([1000.0])})) is None
+    assert moving_part(scene(**{**fields, "observables": ("wavenumber_energy",)})) is None
 
 
 @pytest.fixture(scope="module")
@@ -254,14 +241,14 @@ def transfer_scene(**fields):
 @pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
 def test_a_calibrated_model_takes_the_place_of_the_chains_where_it_covers_the_scene(master, tmp_path):
     wanted = transfer_scene(tolerance=0.2, times=regular_times(0.0, 40.0, 0.01), realizations=1000)
-    planned = plan(wanted, TYPICAL, artifact=master)
+    planned = plan(wanted, artifact=master)
     assert planned.method == planning.ARTIFACT
     exact = tc.band_transfer(replace(wanted, times=regular_times(0.0, 40.0, 1.0)), "modes", long_time=False)
     found = master.solve(torch.eye(4, dtype=torch.float64), exact.times).detach()
     assert float((found - exact.mean).abs().max()) <= 0.2
     file = tmp_path / "q.safetensors"
     master.save(file)
-    again = plan(wanted, TYPICAL, artifact=file)
+    again = plan(wanted, artifact=file)
     assert again.method == planning.ARTIFACT
     assert again.predicted_error == pytest.approx(planned.predicted_error)
 
@@ -278,7 +265,7 @@ def test_a_calibrated_model_takes_the_place_of_the_chains_where_it_covers_the_sc
     ],
 )
 def test_a_calibrated_model_that_does_not_fit_is_named_and_left(master, fields, words):
-    planned = plan(transfer_scene(**fields), TYPICAL, artifact=master)
+    planned = plan(transfer_scene(**fields), artifact=master)
     assert planned.method != planning.ARTIFACT
     assert words in planned.reasons[-1]
 
@@ -321,14 +308,6 @@ def test_chains_too_long_for_the_memory_of_a_method_leave_it_out():
     wanted = scene(
         n_particles=300_000, excitation=tc.StandingWave(tones=(100_000,)), times=torch.tensor([10.0]), tolerance=1e-6
     )
-    planned = plan(wanted, TYPICAL)
+    planned = plan(wanted)
     assert planned.method == "chebyshev"
     assert not {"modes", "tridiagonal"} & {other.method for other in planned.runners_up}
-
-
-def test_measured_speeds_are_positive_and_short():
-    found = machine.measure()
-    values = {name: value for name, value in vars(found).items() if name not in ("version", "cores", "compilation")}
-    assert all(0 <= value < 10 for value in values.values()), values
-    for name in ("run", "call", "draw", "entry", "trig", "flop", "update", "hertz", "stencil", "sum"):
-        assert 0 < values[name] < 0.1, name

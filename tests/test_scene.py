@@ -111,9 +111,9 @@ VALUE, TYPE = FieldError, FieldTypeError
         ({"n_particles": True}, TYPE, "n_particles must be an integer, got True"),
         ({"n_particles": 255}, VALUE, "n_particles must be even for wavenumber bands, got 255"),
         ({"boundary": "open"}, VALUE, "boundary must be one of periodic, fixed, got 'open'"),
-        ({"disorder": None}, TYPE, "disorder must be a table, got None"),
-        ({"excitation": "impulse"}, TYPE, "excitation must be a table"),
-        ({"stiffness_disorder": 0.3}, TYPE, "stiffness_disorder must be a table"),
+        ({"disorder": None}, TYPE, r"disorder must be a Disorder, e.g. tc.Disorder\(strength=0.3\), got None"),
+        ({"excitation": "impulse"}, TYPE, "excitation must be an Impulse or a StandingWave"),
+        ({"stiffness_disorder": 0.3}, TYPE, "stiffness_disorder must be a Disorder"),
         ({"times": None}, TYPE, "times must be real numbers, got None"),
         ({"times": "now"}, TYPE, "times must be real numbers"),
         ({"times": [True]}, TYPE, "times must be real numbers"),
@@ -157,7 +157,7 @@ VALUE, TYPE = FieldError, FieldTypeError
         ({"damping": 1, "observables": ["long_time_band_energy"]}, VALUE, "damping must be zero for the observable"),
         ({"energy_definition": "both"}, VALUE, "energy_definition must be one of site, bond"),
         ({"energy_definition": "bond", "boundary": "fixed"}, VALUE, "boundary must be 'periodic' for the observable"),
-        ({"si": 3}, TYPE, "si must be a table"),
+        ({"si": 3}, TYPE, "si must be a Scaling"),
     ],
 )
 def test_bad_fields(fields, error, message):

@@ -17,7 +17,12 @@ def check_bands(n_particles: int, n_bands: int) -> int:
     if n_bands > n_particles // 2:
         raise checks.fail("n_bands", f"be at most the number of tones n_particles/2 = {n_particles // 2}", n_bands)
     if (n_particles // 2) % n_bands:
-        raise checks.fail("n_bands", f"divide the number of tones n_particles/2 = {n_particles // 2}", n_bands)
+        tones = n_particles // 2
+        fewer = next(b for b in range(n_bands, 0, -1) if tones % b == 0)
+        more = next(b for b in range(n_bands, tones + 1) if tones % b == 0)
+        raise checks.fail(
+            "n_bands", f"divide the number of tones n_particles/2 = {tones}", f"{n_bands} ({fewer} and {more} do)"
+        )
     return n_particles // 2 // n_bands
 
 

@@ -15,13 +15,12 @@ import hashlib
 import json
 import os
 import re
-import shutil
 import signal
 import threading
 import time
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,8 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.ensemble.statistics import EnsembleMoments, joined
+from torchchain.locks import lock
+from torchchain.progress import log
 
 FORMAT = "torchchain-checkpoint-1"
 EVERY = 5.0
@@ -107,6 +108,8 @@ class Checkpoint:
             total.absorb(moments)
             names.append(part.path.name)
         self.resumed = sum(map(len, total.held()))
+        if self.resumed:
+            log.info(f"{self.resumed} of {realizations} realizations are in {self.folder}: going on from there")
         session = 1 + max((int(part.path.name[:5]) for part in parts), default=0)
         if len(names) > 1:
             self._merge(total, names, session, identity, plan)
@@ -118,8 +121,16 @@ class Checkpoint:
         return Writer(self, self.folder / f"{session:05d}-{rank:05d}.safetensors", header)
 
     def clear(self) -> None:
-        """Remove the folder, once the results are elsewhere."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove the parts, once the results are elsewhere, and the folder if nothing else is in it."""
+        with suppress(OSError):
+            for path in self.folder.iterdir():
+                if _NAME.fullmatch(path.name.removesuffix(".tmp")):
+                    path.unlink(missing_ok=True)
+            self.folder.rmdir()
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Hold the folder while a run reads and writes it; another run's is a FieldError that names it."""
+        return lock(self.folder, "checkpoint")
 
     def _parts(self) -> list[_Part]:
         """The whole parts in the folder, without those that another one replaces."""
@@ -207,12 +218,12 @@ class Writer:
         if moments.trees and (self.kept or self.checkpoint.resumed or self.due):
             self.save(moments)
 
-    def interrupted(self, moments: EnsembleMoments, realizations: int) -> Interrupted:
+    def interrupted(self, moments: EnsembleMoments) -> Interrupted:
         """Keep what is finished, if the run has lasted long enough to, and say what is kept."""
         self.close(moments)
         kept = self.checkpoint.resumed + self.kept
         words = (
-            f"interrupted: {kept} of {realizations} realizations are kept in {self.path.parent}, "
+            f"interrupted: {kept} of {moments.realizations} realizations are kept in {self.path.parent}, "
             "the same command goes on from there"
             if kept
             else "interrupted, nothing was written"

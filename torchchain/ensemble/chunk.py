@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.energy.modal_bands import modal_band_energy
-from torchchain.energy.wavenumber import long_time_band_energy
 from torchchain.ensemble import fused
-from torchchain.ensemble.observables import IN_TIME, is_fused
-from torchchain.ensemble.reach import Reach, ReachExceeded
+from torchchain.ensemble.layout import Layout
+from torchchain.ensemble.moving_part import MovingPart, PartExceeded
+from torchchain.ensemble.observables import Observable, chosen_observables
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.stages import Stages
 from torchchain.evolvers import start
@@ -27,9 +28,10 @@ from torchchain.threads import single_thread
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Realizations first, first + 1, ... of a scene, evolved together; only the part that moves, if that is known.
+    """Realizations first, first + 1, ... of a scene, evolved together in windows of times.
 
-    ``group`` of them, and ``window`` times, go through matrix products at once.
+    :meth:`observe` measures them the cheapest way: on the part of the chains that moves, in the stencil's kernels,
+    in the basis of the modes, or from the states.
     """
 
     scene: Scene
@@ -38,11 +40,8 @@ class Chunk:
     state: State
     method: str
     options: dict[str, Any]
-    times: Tensor
-    window: int
-    group: int
+    layout: Layout
     stages: Stages
-    reach: Reach | None = None
     watch: Callable[[Chain, Trajectory], None] | None = None
 
     @cached_property
@@ -51,74 +50,111 @@ class Chunk:
         with self.stages("eigen-decomposition"):
             return normal_modes(self.chain)
 
-    def trajectories(self) -> Iterator[Trajectory]:
-        """The states at consecutive windows of the scene's times."""
-        options = {"modes": self.modes, **self.options} if self.method == "modes" else self.options
-        with self.stages("evolution"):
-            advance = start(self.chain, self.state, self.method, **options)
-        for begin in range(0, len(self.times), self.window):
-            with self.stages("evolution"):
-                trajectory = advance(self.times[begin : begin + self.window])
-            if self.watch is not None:
-                self.watch(self.chain, trajectory)
-            yield trajectory
+    @cached_property
+    def times(self) -> Tensor:
+        return self.scene.times.to(self.layout.device)
 
     def observe(self, names: Sequence[str]) -> dict[str, Tensor]:
-        """The named observables at all times, (realization, [tone,] *axes)."""
-        if not names:
-            return {}
-        if self.reach is not None and self.reach.pays(is_fused(self.method, names)):
-            with suppress(ReachExceeded):  # the whole chain, then
-                return self._observe_part(self.reach, names)
-        if is_fused(self.method, names):
-            given = (self.chain, self.state, self.times)
-            definition = self.scene.energy_definition
-            with self.stages("evolution with observables"):
-                if self.watch is not None:
-                    self.watch(self.chain, start(self.chain, self.state, self.method, **self.options)(self.times[-1:]))
-                if "band_energy" in names:
-                    return {
-                        "band_energy": fused.band_energy(*given, self.scene.n_bands, True, definition, **self.options)
-                    }
-                moments = fused.energy_moments(*given, definition, **self.options)
-            every = {"total_energy": moments.total, "center": moments.center, "width": moments.width}
-            return {name: every[name] for name in names}
-        if self.method == "modes" and list(names) == ["band_energy"] and self.scene.energy_definition == "site":
-            modes, n_bands = self.modes, self.scene.n_bands
-            with self.stages("evolution with observables"):
-                windows = self.times.split(self.window)
-                bands = [modal_band_energy(self.chain, self.state, part, n_bands, modes=modes) for part in windows]
-                return {"band_energy": torch.cat(bands, dim=-2)}
-        parts: dict[str, list[Tensor]] = {name: [] for name in names}
-        for trajectory in self.trajectories():
-            with self.stages("observables"):
-                for name in names:
-                    parts[name].append(IN_TIME[name].of(self.scene, self.chain, trajectory))
-        return {name: torch.cat(values, dim=-len(IN_TIME[name].axes)) for name, values in parts.items()}
+        """The named observables, (realization, [tone,] *axes)."""
+        entries = chosen_observables(names)
+        found = self._in_time([entry for entry in entries if entry.in_time])
+        return found | {entry.name: self._average(entry) for entry in entries if not entry.in_time}
 
-    def _observe_part(self, part: Reach, names: Sequence[str]) -> dict[str, Tensor]:
-        """:meth:`observe` from the part of the chains that moves."""
+    def _in_time(self, entries: list[Observable]) -> dict[str, Tensor]:
+        if not entries:
+            return {}
+        if self.layout.part is not None and all(entry.local for entry in entries):
+            with suppress(PartExceeded):  # the whole chain, then
+                return self._of_part(self.layout.part, entries)
+        kinds = {entry.kernel for entry in entries}
+        if self.method == "chebyshev" and kinds == {"bands"}:
+            return self._by_kernel(entries, self._bands_by_kernel)
+        if self.method == "chebyshev" and None not in kinds and "bands" not in kinds:
+            return self._by_kernel(entries, self._moments_by_kernel)
+        if self.method == "modes" and kinds == {"bands"} and self.scene.energy_definition == "site":
+            bands = self._bands_by_modes()
+            return {entry.name: bands for entry in entries}
+        return self._of_states(entries)
+
+    def _of_part(self, part: MovingPart, entries: list[Observable]) -> dict[str, Tensor]:
+        """From the part of the chains that moves."""
         inside = replace(
             self,
             scene=part.scene(self.scene),
             chain=part.chain(self.chain),
             state=part.state(self.state),
-            reach=None,
+            layout=replace(self.layout, part=None),
             watch=part.check,
         )
-        return {name: part.embed(name, values) for name, values in inside.observe(names).items()}
+        return {name: part.embed(name, values) for name, values in inside._in_time(entries).items()}
 
-    def long_time(self) -> Tensor:
-        """Infinite-time average of the normalized band energies, (realization, [tone,] band)."""
-        if len(self.chain.masses) > self.group:
-            firsts = range(0, len(self.chain.masses), self.group)
-            return torch.cat([self._some(first, first + self.group).long_time() for first in firsts])
+    def _by_kernel(self, entries: list[Observable], measure: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+        """From the stencil's kernels, which leave no states behind."""
+        with self.stages("evolution with observables"):
+            if self.watch is not None:
+                self.watch(self.chain, start(self.chain, self.state, self.method, **self.options)(self.times[-1:]))
+            found = measure()
+        return {entry.name: found[entry.kernel] for entry in entries if entry.kernel is not None}
+
+    def _bands_by_kernel(self) -> dict[str, Tensor]:
+        n_bands, definition = self.scene.n_bands, self.scene.energy_definition
+        given = self.chain, self.state, self.times, n_bands, True, definition
+        return {"bands": fused.band_energy(*given, **self.options)}
+
+    def _moments_by_kernel(self) -> dict[str, Tensor]:
+        given = self.chain, self.state, self.times, self.scene.energy_definition
+        return vars(fused.energy_moments(*given, **self.options))
+
+    def _bands_by_modes(self) -> Tensor:
+        modes, n_bands = self.modes, self.scene.n_bands
+        with self.stages("evolution with observables"):
+            windows = self.times.split(self.layout.window)
+            bands = [modal_band_energy(self.chain, self.state, part, n_bands, modes=modes) for part in windows]
+            return torch.cat(bands, dim=-2)
+
+    def _of_states(self, entries: list[Observable]) -> dict[str, Tensor]:
+        parts: dict[str, list[Tensor]] = {entry.name: [] for entry in entries}
+        for trajectory in self.trajectories():
+            with self.stages("observables"):
+                for entry in entries:
+                    assert entry.compute is not None
+                    values = entry.compute(self.scene, self.chain, trajectory)
+                    parts[entry.name].append(self._checked(entry, values, len(trajectory.times)))
+        return {entry.name: torch.cat(parts[entry.name], dim=-len(entry.axes)) for entry in entries}
+
+    def trajectories(self) -> Iterator[Trajectory]:
+        """The states at consecutive windows of the scene's times."""
+        options = {"modes": self.modes, **self.options} if self.method == "modes" else self.options
+        with self.stages("evolution"):
+            advance = start(self.chain, self.state, self.method, **options)
+        for window in self.times.split(self.layout.window):
+            with self.stages("evolution"):
+                trajectory = advance(window)
+            if self.watch is not None:
+                self.watch(self.chain, trajectory)
+            yield trajectory
+
+    def _average(self, entry: Observable) -> Tensor:
+        """An observable that needs no times, a group of realizations after the other."""
+        assert entry.average is not None
+        group = self.layout.group
+        if len(self.chain.masses) > group:
+            firsts = range(0, len(self.chain.masses), group)
+            return torch.cat([self._some(first, first + group)._average(entry) for first in firsts])
         with single_thread():
             modes = self.modes
             with self.stages("long-time average"):
-                return long_time_band_energy(
-                    self.chain, self.state, self.scene.n_bands, modes=modes, definition=self.scene.energy_definition
-                )
+                return self._checked(entry, entry.average(self.scene, self.chain, self.state, modes), 0)
+
+    def _checked(self, entry: Observable, values: Tensor, n_times: int) -> Tensor:
+        """The values, if their shape is that of the observable's axes."""
+        n = self.scene.n_particles
+        lengths = {"time": n_times, "particle": n, "wavenumber": n // 2 + 1, "band": self.scene.n_bands}
+        shape = (*self.state.displacement.shape[:-1], *(lengths[axis] for axis in entry.axes))
+        checks.instance(f"observable {entry.name}", values, Tensor)
+        if tuple(values.shape) != shape:
+            raise checks.fail(f"observable {entry.name}", f"give shape {shape}", f"shape {tuple(values.shape)}")
+        return values
 
     def _some(self, low: int, high: int) -> Chunk:
         """Some of the realizations."""

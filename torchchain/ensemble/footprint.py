@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import torch
 
 from torchchain import checks
+from torchchain.ensemble.observables import chosen_observables
 from torchchain.ensemble.scene import Scene
+from torchchain.evolvers import METHODS
 from torchchain.memory import gigabytes, memory
 
 STATES = 10  # arrays of the size of the states that evolution and observables hold at once
 FUSED = 12  # of the size of a state, in the stencil's kernels
-MATRICES = {"modes": 8, "tridiagonal": 8, "damped": 48}  # of n_particles^2 numbers
 
 
 @dataclass(frozen=True)
@@ -31,23 +32,20 @@ class Footprint:
     results: int
 
 
-def footprint(
-    scene: Scene, method: str, fused: bool, names: tuple[str, ...], axes: dict[str, tuple[str, ...]]
-) -> Footprint:
+def footprint(scene: Scene, method: str, fused: bool) -> Footprint:
     """What one realization of a scene takes.
 
     Args:
         scene: what is wanted.
         method: a name of ``evolvers.METHODS``, or "auto" for what every method takes at least.
         fused: whether the stencil's kernels measure without storing states.
-        names: of the observables.
-        axes: of each observable, without those of realization and tone.
     """
     rows, n = max(1, len(scene.tones)), scene.n_particles
-    long_time = "long_time_band_energy" in names
+    observables = chosen_observables(scene.observables)
     lengths = {"time": len(scene.times), "particle": n, "wavenumber": n // 2 + 1, "band": scene.n_bands}
-    numbers = sum(math.prod(lengths[axis] for axis in axes[name]) for name in names)
-    matrices = max(MATRICES.get(method, 0), MATRICES["modes"] * long_time)
+    numbers = sum(math.prod(lengths[axis] for axis in entry.axes) for entry in observables)
+    averages = any(not entry.in_time for entry in observables)
+    matrices = max(0 if method == "auto" else METHODS[method].matrices, METHODS["modes"].matrices * averages)
     return Footprint(
         8 * matrices * n * n, 8 * rows * n * (FUSED if fused or method == "auto" else STATES), 8 * rows * numbers
     )

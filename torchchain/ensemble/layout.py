@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
 from torchchain.ensemble import footprint
-from torchchain.ensemble.observables import IN_TIME, is_fused
-from torchchain.ensemble.reach import reach
+from torchchain.ensemble.moving_part import MovingPart, moving_part
+from torchchain.ensemble.observables import is_fused
 from torchchain.ensemble.scene import Scene
 from torchchain.memory import memory
 
@@ -22,63 +21,70 @@ BLOCKS = 20
 
 
 @dataclass(frozen=True)
-class Layout:
-    """How the realizations of a scene are cut.
+class Chunks:
+    """Realizations of a chunk, a multiple of the layout's group, and how many chunks are under way at once."""
 
-    Attributes:
-        window, group: times and realizations whose states go through matrix products together; from the scene, the
-            method and the kind of device alone, as they decide how products round.
-        size: realizations of a chunk, a multiple of ``group``.
-        workers: chunks under way at once.
-    """
-
-    window: int
-    group: int
     size: int
     workers: int
 
 
-def layout(
-    scene: Scene,
-    method: str,
-    names: Sequence[str],
-    device: torch.device,
-    realizations: int | None = None,
-    memory_budget: int | None = None,
-) -> Layout:
-    """The layout of a scene's realizations, or of those of them that are still wanted.
+@dataclass(frozen=True)
+class Layout:
+    """How a scene's realizations go through a method, from the scene, the method and the kind of device alone.
+
+    Attributes:
+        device: where the chains are computed.
+        fused: whether the stencil's kernels measure without storing states.
+        part: of the chains that is computed; None for all.
+        window, group: times and realizations whose states go through matrix products together: they decide how
+            products round.
+        held: bytes of a realization under way.
+        largest: realizations of a chunk at most.
+    """
+
+    device: torch.device
+    fused: bool
+    part: MovingPart | None
+    window: int
+    group: int
+    held: int
+    largest: int
+
+    def chunks(self, realizations: int, memory_budget: int | None = None) -> Chunks:
+        """The chunks of so many realizations that are still wanted, within bytes for all under way."""
+        budget = memory(self.device) // 4 if memory_budget is None else memory_budget
+        threads = torch.get_num_threads() if self.device.type == "cpu" else 1
+        if self.fused:
+            workers = max(1, min(threads, realizations))
+            half = -(-realizations // (2 * workers))  # two chunks a worker, for the progress bar
+            size = max(1, min(half, self.largest, budget // workers // self.held))
+            return Chunks(-(-size // self.group) * self.group, workers)
+        fitting = budget // (self.group * self.held)
+        return Chunks(self.group, max(1, min(threads, -(-realizations // self.group), fitting)))
+
+
+def layout(scene: Scene, method: str, device: torch.device) -> Layout:
+    """The layout of a scene by a method, or by "auto" what every method takes at least.
 
     Raises:
         FieldError: if one realization at a time takes more memory than there is.
     """
-    fused = device.type == "cpu" and is_fused(method, names)
-    axes = {name: IN_TIME[name].axes if name in IN_TIME else ("band",) for name in names}
-    part = None if fused else reach(scene)
-    whole, inside = (
-        footprint.footprint(each, method, fused, tuple(names), axes)
-        for each in (scene, part.scene(scene) if part else scene)
-    )
-    one = replace(inside, results=whole.results)
-    every = scene.distinct_realizations
-    wanted = every if realizations is None else realizations
+    fused = device.type == "cpu" and is_fused(method, scene.observables)
+    part = moving_part(scene, method)
+    cut = scene if part is None or fused else part.scene(scene)
+    one = replace(footprint.footprint(cut, method, fused), results=footprint.footprint(scene, method, fused).results)
+    every, n_times = scene.distinct_realizations, len(scene.times)
     together, few = TOGETHER[device.type], max(1, every // GROUPS)
-    window = len(scene.times) if fused else min(len(scene.times), max(1, together // one.state))
+    window = n_times if fused else min(n_times, max(1, together // one.state))
     held = one.state if fused else one.matrices + one.state * window
     footprint.check(scene, one, 1 if fused else window, BLOCKS + every.bit_length(), device)
-    budget = memory(device) // 4 if memory_budget is None else memory_budget
-    threads = torch.get_num_threads() if device.type == "cpu" else 1
-
-    def whole_samples(count: int) -> int:
-        return -(-count // scene.sample_size) * scene.sample_size
-
+    held += 2 * one.results
     if fused:
-        group = whole_samples(max(1, min(few, DECOMPOSED[device.type] // (64 * scene.n_particles**2))))
-        points = max(1, len(scene.tones)) * scene.n_particles * max(len(scene.times), int(scene.times[-1]))
-        workers = max(1, min(threads, wanted))
-        half = -(-wanted // (2 * workers))  # two chunks a worker, for the progress bar
-        size = max(1, min(half, CHUNK_WORK // points, budget // workers // (held + 2 * one.results)))
-        return Layout(window, group, -(-size // group) * group, workers)
-    few = max(1, min(few, together // scene.n_particles))  # masses of the whole chains
-    group = whole_samples(max(1, min(few, (one.matrices + together) // (held + 2 * one.results))))
-    chunk = group * (held + 2 * one.results)
-    return Layout(window, group, group, max(1, min(threads, -(-wanted // group), budget // chunk)))
+        group = min(few, DECOMPOSED[device.type] // (64 * scene.n_particles**2))
+        points = max(1, len(scene.tones)) * scene.n_particles * max(n_times, int(scene.times[-1]))
+        largest = CHUNK_WORK // points
+    else:
+        few = max(1, min(few, together // scene.n_particles))  # masses of the whole chains
+        group = largest = min(few, (one.matrices + together) // held)
+    group = -(-max(1, group) // scene.sample_size) * scene.sample_size  # whole samples
+    return Layout(device, fused, part, window, group, held, largest)

@@ -1,31 +1,81 @@
-"""What can be measured on a trajectory: axes, unit, label and how each observable is computed."""
+"""What can be measured: one record an observable, one registry."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.excitation import Impulse
-from torchchain.chain.states import Trajectory
+from torchchain.chain.states import State, Trajectory
+from torchchain.energy import wavenumber
 from torchchain.energy.space import energy_center, energy_width, particle_energy, total_energy
-from torchchain.energy.wavenumber import band_energy, wavenumber_energy
-from torchchain.ensemble.scene import Scene
+from torchchain.modes.spectrum import NormalModes
 
-MOMENTS = frozenset({"center", "total_energy", "width"})
+if TYPE_CHECKING:
+    from torchchain.ensemble.scene import Scene
+
+AXES = ("time", "particle", "wavenumber", "band")
+KERNELS = ("bands", "total", "center", "width")
 
 
 @dataclass(frozen=True)
 class Observable:
-    """A quantity of a trajectory: the axes after realization and tone, its unit and how it is computed."""
+    """A quantity measured on the chains of a scene.
 
+    Attributes:
+        name: in scenes, results and on the command line.
+        axes: after those of realization and tone, from ``AXES``; "time" first if it is there.
+        unit: in the library's units, "1" for none.
+        label: a few words for axes of figures and files.
+        compute: ``(scene, chain, trajectory)`` to a tensor (realization, [tone,] *axes), called with windows of times.
+        average: in place of ``compute`` for what needs no times: ``(scene, chain, state, modes)`` to the same.
+        local: whether particles at rest add nothing, so that they may be left out.
+        is_place: whether the values count particles, from 1.
+        wavenumbers: whether it is defined in wavenumber space: linear contacts alone.
+        bands: whether it needs ``n_bands``.
+        damped: whether damped chains have it.
+        passes: elementwise passes over a state that computing it takes, for the plan's estimate of time.
+        kernel: what the stencil's kernels measure it as without storing states: "bands", or "total", "center" or
+            "width" of the energy, which come together.
+    """
+
+    name: str
     axes: tuple[str, ...]
     unit: str
-    long_name: str
-    of: Callable[[Scene, Chain, Trajectory], Tensor]
+    label: str
+    compute: Callable[[Scene, Chain, Trajectory], Tensor] | None = None
+    average: Callable[[Scene, Chain, State, NormalModes], Tensor] | None = None
+    local: bool = False
+    is_place: bool = False
+    wavenumbers: bool = False
+    bands: bool = False
+    damped: bool = True
+    passes: float = 20.0
+    kernel: str | None = None
+
+    def __post_init__(self) -> None:
+        checks.instance("observable.name", self.name, str)
+        if not self.name.isidentifier() or self.name.endswith("_stderr"):
+            raise checks.fail("observable.name", "be a name that does not end in _stderr", repr(self.name))
+        for axis in self.axes:
+            checks.choice("observable.axes", axis, AXES)
+        if self.kernel is not None:
+            checks.choice("observable.kernel", self.kernel, KERNELS)
+        if (self.compute is None) == (self.average is None):
+            raise checks.fail("observable", "have either compute or average", self.name)
+        if (self.compute is not None) != (self.axes[:1] == ("time",)):
+            raise checks.fail("observable.axes", "start with 'time' for compute, and only then", self.axes)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether it is measured at the output times."""
+        return self.compute is not None
 
 
 def _energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
@@ -48,7 +98,7 @@ def _openings(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
 
 def _band_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
     """Share of the energy, of that at the start where damping takes some of it."""
-    share = band_energy(chain, trajectory, scene.n_bands, scene.damping == 0, scene.energy_definition)
+    share = wavenumber.band_energy(chain, trajectory, scene.n_bands, scene.damping == 0, scene.energy_definition)
     if scene.damping == 0:
         return share
     state = scene.state(chain)
@@ -56,34 +106,83 @@ def _band_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
     return share / total_energy(chain, begin)[..., None]
 
 
-ENERGY_UNIT = "contact stiffness * initial overlap^2"
-IN_TIME: dict[str, Observable] = {
-    "displacement": Observable(("time", "particle"), "initial overlap", "displacement", lambda s, c, t: t.displacement),
-    "dissipated": Observable(("time",), ENERGY_UNIT, "energy lost to contact damping so far", _dissipated),
-    "energy": Observable(("time", "particle"), ENERGY_UNIT, "energy per particle", _energy),
-    "openings": Observable(("time",), "1", "contacts that were open at any step so far", _openings),
-    "source_energy": Observable(("time",), ENERGY_UNIT, "energy of the source particle", _source_energy),
-    "total_energy": Observable(("time",), ENERGY_UNIT, "total energy", lambda s, c, t: total_energy(c, t)),
-    "center": Observable(("time",), "particle", "center of energy R", lambda s, c, t: energy_center(_energy(s, c, t))),
-    "width": Observable(
-        ("time",), "particle^2", "mean squared width r^2", lambda s, c, t: energy_width(_energy(s, c, t))
+def _long_time_band_energy(scene: Scene, chain: Chain, state: State, modes: NormalModes) -> Tensor:
+    return wavenumber.long_time_band_energy(
+        chain, state, scene.n_bands, modes=modes, definition=scene.energy_definition
+    )
+
+
+_JOULE = "contact stiffness * initial overlap^2"
+OBSERVABLES: dict[str, Observable] = {}
+"""Every observable by name; :func:`register_observable` adds to it."""
+
+
+def register_observable(observable: Observable) -> Observable:
+    """Make an observable of your own a name that scenes, checkpoints, files, the plan and the command line know.
+
+    >>> import torchchain as tc
+    >>> peak = tc.Observable("peak", ("time",), "initial overlap", "largest displacement",
+    ...                      lambda scene, chain, trajectory: trajectory.displacement.abs().amax(-1), local=True)
+    >>> _ = tc.register_observable(peak)
+    >>> scene = tc.Scene(n_particles=32, realizations=2, excitation=tc.Impulse(), times=[1.0], observables=("peak",))
+    >>> tc.simulate(scene)["peak"].dims
+    ('time',)
+
+    Raises:
+        FieldError: for a name that is taken.
+    """
+    checks.instance("observable", observable, Observable)
+    if observable.name in OBSERVABLES:
+        raise checks.fail("observable.name", "not be taken", repr(observable.name))
+    OBSERVABLES[observable.name] = observable
+    return observable
+
+
+for _one in (
+    Observable(
+        "band_energy", ("time", "band"), "1", "share of the energy in a band (of the start's energy, where damping takes some)",
+        _band_energy, wavenumbers=True, bands=True, passes=30, kernel="bands",
     ),
-    "wavenumber_energy": Observable(
-        ("time", "wavenumber"),
-        ENERGY_UNIT,
-        "energy at |k|",
-        lambda s, c, t: wavenumber_energy(c, t, s.energy_definition),
+    Observable(
+        "center", ("time",), "particle", "center of energy R", lambda s, c, t: energy_center(_energy(s, c, t)),
+        local=True, is_place=True, passes=18, kernel="center",
     ),
-    "band_energy": Observable(
-        ("time", "band"),
-        "1",
-        "share of the energy in a band (of the start's energy, where damping takes some)",
-        _band_energy,
+    Observable(
+        "displacement", ("time", "particle"), "initial overlap", "displacement", lambda s, c, t: t.displacement,
+        local=True, passes=2,
     ),
-}
+    Observable("dissipated", ("time",), _JOULE, "energy lost to contact damping so far", _dissipated, passes=0),
+    Observable("energy", ("time", "particle"), _JOULE, "energy per particle", _energy, local=True, passes=16),
+    Observable(
+        "long_time_band_energy", ("band",), "1", "infinite-time average of the share of the energy in a band",
+        average=_long_time_band_energy, wavenumbers=True, bands=True, damped=False,
+    ),
+    Observable("openings", ("time",), "1", "contacts that were open at any step so far", _openings, passes=0),
+    Observable(
+        "source_energy", ("time",), _JOULE, "energy of the source particle", _source_energy, local=True, passes=14
+    ),
+    Observable(
+        "total_energy", ("time",), _JOULE, "total energy", lambda s, c, t: total_energy(c, t), local=True, passes=12,
+        kernel="total",
+    ),
+    Observable(
+        "wavenumber_energy", ("time", "wavenumber"), _JOULE, "energy at |k|",
+        lambda s, c, t: wavenumber.wavenumber_energy(c, t, s.energy_definition), wavenumbers=True, passes=30,
+    ),
+    Observable(
+        "width", ("time",), "particle^2", "mean squared width r^2", lambda s, c, t: energy_width(_energy(s, c, t)),
+        local=True, passes=22, kernel="width",
+    ),
+):  # fmt: skip
+    register_observable(_one)
+
+
+def chosen_observables(names: Sequence[str]) -> list[Observable]:
+    """The records of the names."""
+    return [OBSERVABLES[name] for name in names]
 
 
 def is_fused(method: str, names: Sequence[str]) -> bool:
-    """Whether the stencil's kernels measure the observables without storing states."""
-    in_time = [name for name in names if name in IN_TIME]
-    return method == "chebyshev" and (MOMENTS.issuperset(in_time) or in_time == ["band_energy"])
+    """Whether the stencil's kernels measure all that is measured in time: the bands, or totals, centers and widths."""
+    kinds = {entry.kernel for entry in chosen_observables(names) if entry.in_time}
+    return method == "chebyshev" and (kinds == {"bands"} or kinds <= {"total", "center", "width"})

@@ -4,36 +4,41 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import torch
 
 from torchchain import checks
-from torchchain.ensemble.layout import layout
-from torchchain.ensemble.machine import Machine, this_machine
-from torchchain.ensemble.predictions import Facts, error_of, seconds, settle
+from torchchain.ensemble.layout import Layout, layout
+from torchchain.ensemble.predictions import TRIG, Facts, cost, error_of, settle
+from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.scene import Scene
 from torchchain.evolvers import METHODS
 from torchchain.threads import single_thread
 
-CANDIDATES = ("modes", "tridiagonal", "chebyshev", "verlet", "symplectic4", "damped", "dopri8")
-# Only these keep what they compute in float32: the stencil kernels work in float64 whatever the input, and modes from
-# a float32 eigen-solver miss the check of their orthogonality on chains of 1000 particles.
-SINGLE = ("verlet", "symplectic4")
 ARTIFACT = "master equation"
 ORDERED_TOLERANCE = 1e-9
-SHARE_OF_NOISE = 1 / 3  # adds 5 % to the statistical error
+FRACTION_OF_NOISE = 1 / 3  # adds 5 % to the statistical error
+SMALL_WORK = 0.02  # seconds of work that are not worth loading compiled kernels for, which takes half a second
+RUN_SECONDS = 3e-3  # of any run
+CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One way to run a scene: method, options and precision, what it is predicted to cost and to err, and may err."""
+    """One way to run a scene: method, options and precision, what it is predicted to cost and to err, and may err.
+
+    ``cost`` is in seconds of one nominal core: it ranks the ways, the same on every machine.
+    """
 
     method: str
     options: dict[str, Any]
     predicted_error: float
+    cost: float
     predicted_seconds: float
     allowed: float
     dtype: torch.dtype = torch.float64
@@ -49,8 +54,8 @@ class Choice:
         return self.method + (f" ({', '.join(options)})" if options else "")
 
 
-@dataclass(frozen=True)
-class Plan:
+@dataclass(frozen=True, repr=False)
+class Plan(Printed):
     """How a scene will be run.
 
     Attributes:
@@ -61,9 +66,10 @@ class Plan:
         tolerance: error that the plan keeps to, relative to the scale of the observables.
         predicted_error: of the method, in the same measure; the ensemble's own error comes on top.
         predicted_seconds: wall time on this machine.
-        reach: particles that the wave can have reached by the last time.
+        reach: particles that the wave can have set in motion by the last time.
         reasons: why, in plain words.
         runners_up: the other ways that meet the tolerance, and those that do not, by predicted time.
+        cost: seconds of one nominal core.
     """
 
     scene: Scene
@@ -76,6 +82,7 @@ class Plan:
     reach: int
     reasons: tuple[str, ...]
     runners_up: tuple[Choice, ...] = field(default=())
+    cost: float = 0.0
 
     @property
     def run_options(self) -> dict[str, Any]:
@@ -86,42 +93,41 @@ class Plan:
     def choices(self) -> tuple[Choice, ...]:
         """The chosen way and all others."""
         error, seconds = self.predicted_error, self.predicted_seconds
-        return (Choice(self.method, self.options, error, seconds, self.tolerance, self.dtype), *self.runners_up)
+        best = Choice(self.method, self.options, error, self.cost, seconds, self.tolerance, self.dtype)
+        return (best, *self.runners_up)
+
+    def _rows(self) -> dict[str, str]:
+        best, *others = self.choices
+        near = [
+            f"{other} {other.predicted_seconds:.2g} s{'' if other.good else ', too coarse'}" for other in others[:3]
+        ]
+        return {
+            "method": f"{replace(best, dtype=torch.float64)}, {str(self.dtype).removeprefix('torch.')}, "
+            f"{self.scene.contact} contacts",
+            "error": f"{self.predicted_error:.1e} predicted, tolerance {self.tolerance:.1e}",
+            "time": f"{self.predicted_seconds:.2g} s predicted",
+            "moving": f"{self.reach} of {self.scene.n_particles} particles",
+            "because": "\n".join(self.reasons),
+            "runner-up": "; ".join(near) or "none",
+        }
 
     def __str__(self) -> str:
-        best, *others = self.choices
-        lines = [
-            f"contact    {self.scene.contact}",
-            f"method     {replace(best, dtype=torch.float64)}",
-            f"precision  {str(self.dtype).removeprefix('torch.')}",
-            f"tolerance  {self.tolerance:.1e}",
-            f"error      {self.predicted_error:.1e} predicted",
-            f"time       {self.predicted_seconds:.2g} s predicted",
-            f"reach      {self.reach} of {self.scene.n_particles} particles",
-            *(f"because    {reason}" for reason in self.reasons),
-            *(
-                f"runner-up  {other}: {other.predicted_seconds:.2g} s, error {other.predicted_error:.1e}"
-                + ("" if other.good else ", too large")
-                for other in others
-            ),
-        ]
-        return "\n".join(lines)
+        return repr(self)
 
 
 StandIn = Callable[[Scene, float], tuple[list[Choice], list[str]]]
 """What could take the place of the chains of a scene within a tolerance, and what is to be said of it."""
 
 
-def plan(scene: Scene, machine: Machine | None = None, stand_in: StandIn | None = None) -> Plan:
+def plan(scene: Scene, stand_in: StandIn | None = None) -> Plan:
     """The cheapest way to a scene whose predicted error is within its tolerance.
 
     Without a tolerance the method's error may be a third of the statistical error of the ensemble, to which it adds
-    5 %: a finer integrator would be waste. Errors come from each method's own theory, times from counted work and the
-    speeds of the machine.
+    5 %: a finer integrator would be waste. Errors come from each method's own theory, costs from counted work on a
+    nominal core, so that a scene has one plan on every machine and at every time.
 
     Args:
         scene: what is wanted.
-        machine: speeds; None for this machine's own (measured once, then cached).
         stand_in: what else could give the observables.
 
     Returns:
@@ -131,26 +137,29 @@ def plan(scene: Scene, machine: Machine | None = None, stand_in: StandIn | None 
         FieldError: if no method can treat the scene, or none reaches the tolerance.
     """
     checks.instance("scene", scene, Scene)
-    checks.instance("machine", machine, Machine, type(None))
-    machine = machine or this_machine()
     with single_thread():
-        return _plan(scene, machine, stand_in)
+        return _plan(scene, stand_in)
 
 
-def _plan(scene: Scene, machine: Machine, stand_in: StandIn | None) -> Plan:
+def _plan(scene: Scene, stand_in: StandIn | None) -> Plan:
     facts = Facts(scene if scene.contact != "auto" else replace(scene, contact="linear"))
     tolerance, reasons = _tolerance(scene)
     scene, facts, why = _settled(scene, facts, tolerance)
-    usable = [name for name in CANDIDATES if _can(name, scene) and _fits(name, scene)]
+    layouts = {name: _layout(name, scene) for name in METHODS if _can(name, scene)}
+    usable = {name: found for name, found in layouts.items() if found is not None}
     if not usable:
         raise checks.fail("method", "treat the scene's contact, boundary, damping and size", "none")
-    precisions = {name: (torch.float64, torch.float32) if name in SINGLE else (torch.float64,) for name in usable}
-    choices = [_choice(name, facts, tolerance, dtype, machine) for name in usable for dtype in precisions[name]]
+    choices = []
+    for name, cut in usable.items():
+        for dtype in (torch.float64, torch.float32)[: 1 + METHODS[name].single_precision]:
+            options, error = settle(name, facts, tolerance, dtype)
+            work, seconds = _seconds(name, facts, options, dtype, cut)
+            choices.append(Choice(name, options, error, work, seconds, tolerance, dtype))
     remarks: list[str] = []
     if stand_in is not None:
         found, remarks = stand_in(scene, tolerance)
         choices += found
-    choices = sorted(choices, key=lambda choice: choice.predicted_seconds)
+    choices = sorted(choices, key=lambda choice: choice.cost)
     good = [choice for choice in choices if choice.good]
     if not good:
         nearest = min(choices, key=lambda choice: choice.predicted_error)
@@ -159,13 +168,37 @@ def _plan(scene: Scene, machine: Machine, stand_in: StandIn | None) -> Plan:
             f"be at least {nearest.predicted_error:.1e}, what method '{nearest.method}' reaches here",
             tolerance,
         )
-    best = good[0]
-    reasons = [*reasons, *why, *_method_reasons(best, good, facts, machine), *remarks]
+    loaded = [choice for choice in good if choice.method == ARTIFACT or not METHODS[choice.method].compiled]
+    best = loaded[0] if loaded and loaded[0].cost < SMALL_WORK else good[0]
+    reasons = [*reasons, *why, *_method_reasons(best, good, facts, usable), *remarks]
     return Plan(
         scene, best.method, best.options, best.dtype, best.allowed, best.predicted_error, best.predicted_seconds,
-        math.ceil(facts.moving(0)) if facts.reach is None else facts.n, tuple(reasons),
-        tuple(choice for choice in choices if choice is not best),
+        math.ceil(facts.moving()) if facts.part is None else facts.n, tuple(reasons),
+        tuple(choice for choice in choices if choice is not best), best.cost,
     )  # fmt: skip
+
+
+def _seconds(name: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, cut: Layout) -> tuple[float, float]:
+    """Seconds of one nominal core, and wall time here."""
+    chunk = min(cut.group if not cut.fused else max(cut.group, cut.largest), max(1, facts.chains // 4))
+    work = facts.chains * cost(name, facts, options, dtype, chunk)
+    chunks = cut.chunks(facts.chains)
+    parallel = min(chunks.workers, math.ceil(facts.chains / chunks.size))
+    return work, RUN_SECONDS + work * speed() / parallel
+
+
+@cache
+def speed() -> float:
+    """How many times as long as the nominal core a core of this machine takes, from some milliseconds of work."""
+    values = torch.linspace(0, 50, 2**14, dtype=torch.float64)
+    spent = []
+    with single_thread():
+        for _ in range(30):
+            begin = time.thread_time()
+            for _ in range(10):
+                values.cos()
+            spent.append(time.thread_time() - begin)
+    return min(spent) / (10 * len(values) * TRIG)
 
 
 def forecast(scene: Scene, how: Mapping[str, Any], spent: float, statistical: float) -> dict[str, Any]:
@@ -181,16 +214,17 @@ def forecast(scene: Scene, how: Mapping[str, Any], spent: float, statistical: fl
         predicted_seconds, seconds, predicted_error, statistical_error; no prediction for methods that no plan weighs.
     """
     measured = {"seconds": spent, "statistical_error": statistical}
-    if how["method"] not in CANDIDATES:
+    if not METHODS[how["method"]].candidate:
         return measured
     options = json.loads(how["method_options"])
     dtype = torch.float32 if options.pop("dtype", "") == "float32" else torch.float64
     with single_thread():
         facts = Facts(scene)
         suggested, error = settle(how["method"], facts, _tolerance(scene)[0], dtype)
-        if {**suggested, **options} != suggested:
-            error = error_of(how["method"], facts, {**suggested, **options}, dtype)
-        predicted = seconds(how["method"], facts, {**suggested, **options}, dtype, this_machine())
+        options = {**suggested, **options}
+        if options != suggested:
+            error = error_of(how["method"], facts, options, dtype)
+        predicted = _seconds(how["method"], facts, options, dtype, layout(scene, how["method"], CPU))[1]
     return {"predicted_seconds": predicted, **measured, "predicted_error": error}
 
 
@@ -224,62 +258,63 @@ def _tolerance(scene: Scene) -> tuple[float, list[str]]:
     if scene.is_ordered:
         return ORDERED_TOLERANCE, [f"no tolerance asked for and no ensemble error: {ORDERED_TOLERANCE:.0e}"]
     noise = statistical_error(scene)
-    return SHARE_OF_NOISE * noise, [f"no tolerance asked for: a third of the ensemble's own error, about {noise:.1e}"]
+    return FRACTION_OF_NOISE * noise, [
+        f"no tolerance asked for: a third of the ensemble's own error, about {noise:.1e}"
+    ]
 
 
 def _settled(scene: Scene, facts: Facts, tolerance: float) -> tuple[Scene, Facts, list[str]]:
     """The scene with its contact law, what it takes, and why."""
-    percent = f"{100 * facts.deviation:.1e} %"
-    size = f"elongation about {facts.elongation:.1e} of the overlap"
-    if scene.contact == "hertz":
-        small = f"; linear contacts would be off by {percent} of the force" if facts.deviation < 0.05 else ""
-        return scene, facts, [f"Hertz contacts asked for ({size}){small}"]
-    if scene.contact == "linear":
-        return scene, facts, [f"linear contacts: {size}, force off by {percent}"]
-    if facts.deviation <= tolerance:
-        why = f"linear contacts: {size}, force off by {percent}, within the tolerance"
-        return replace(scene, contact="linear"), facts, [why]
+    size = f"elongation about {facts.elongation:.1e} of the overlap, force off by {100 * facts.deviation:.1e} %"
+    if scene.contact != "auto":
+        return (
+            scene,
+            facts,
+            [
+                f"{scene.contact.capitalize()} contacts asked for: {size}"
+                + (" by linear ones" if scene.contact == "hertz" else " from Hertz contacts")
+            ],
+        )
+    off = facts.accumulated
+    growing = f"{size} and energies by up to {off:.1e} at the last time"
+    if off <= tolerance:
+        return replace(scene, contact="linear"), facts, [f"linear contacts: {growing}, within the tolerance"]
     scene = replace(scene, contact="hertz")
-    return scene, Facts(scene), [f"Hertz contacts: {size}, linear force off by {percent}, more than the tolerance"]
+    return scene, Facts(scene), [f"Hertz contacts: with linear ones {growing}, more than the tolerance"]
 
 
 def _can(name: str, scene: Scene) -> bool:
+    """Whether the plan weighs the method for the scene."""
     entry = METHODS[name]
-    fits = scene.boundary in entry.boundaries and scene.contact in entry.contacts
-    if name == "dopri8" and scene.contact == "linear" and scene.damping == 0:
+    fits = entry.candidate and scene.boundary in entry.boundaries and scene.contact in entry.contacts
+    if scene.damping > 0:
+        return fits and entry.damped
+    if "rtol" in entry.options and scene.contact == "linear":
         return False  # the other methods are exact there
-    return fits and (scene.damping == 0 or entry.damped) and not (name == "damped" and scene.damping == 0)
+    return fits and not (entry.damped and entry.matrices)  # twice the matrices of the undamped modes
 
 
-def _fits(name: str, scene: Scene) -> bool:
-    """Whether the memory is enough for one realization."""
+def _layout(name: str, scene: Scene) -> Layout | None:
+    """The layout of the scene by a method, or None where the memory is not enough for one realization."""
     try:
-        layout(scene, name, scene.observables, torch.device("cpu"))
+        return layout(scene, name, CPU)
     except checks.FieldError:
-        return False
-    return True
+        return None
 
 
-def _choice(name: str, facts: Facts, tolerance: float, dtype: torch.dtype, machine: Machine) -> Choice:
-    options, error = settle(name, facts, tolerance, dtype)
-    return Choice(name, options, error, seconds(name, facts, options, dtype, machine), tolerance, dtype)
-
-
-def _method_reasons(best: Choice, good: list[Choice], facts: Facts, machine: Machine) -> list[str]:
+def _method_reasons(best: Choice, good: list[Choice], facts: Facts, layouts: Mapping[str, Layout]) -> list[str]:
     reasons = [] if best.method == ARTIFACT else [f"'{best.method}': {METHODS[best.method].summary}"]
-    if len(good) > 1:
-        ratio = good[1].predicted_seconds / max(best.predicted_seconds, 1e-12)
+    if best is not good[0]:
+        reasons.append(f"'{good[0]}' would be faster, but {SMALL_WORK:g} s of work are not worth loading its kernels")
+    elif len(good) > 1:
+        ratio = good[1].cost / max(best.cost, 1e-12)
         reasons.append(f"next best '{good[1]}' is predicted to take {ratio:.1f} times as long")
     if best.dtype == torch.float32:
         reasons.append("float32 is accurate enough here, and its loops are faster")
-    elif best.method == "chebyshev":
-        reasons.append("float64: the stencil kernels compute in it whatever the input")
-    if facts.reach is not None:
+    if facts.part is not None:
         n, whole = facts.n, facts.scene.n_particles
         reasons.append(f"the wave reaches {n} of {whole} particles by the last time: the others are left out")
     if best.method != ARTIFACT:
-        cut = layout(facts.scene, best.method, facts.scene.observables, torch.device("cpu"))
+        cut = layouts[best.method].chunks(facts.chains)
         reasons.append(f"chains {facts.chains}, in chunks of {min(cut.size, facts.chains)}, {cut.workers} side by side")
-    if machine.compilation and best.method not in ("chebyshev", "verlet", "symplectic4"):
-        reasons.append(f"compiling the stencil's kernels first would take about {machine.compilation:.0f} s")
     return reasons

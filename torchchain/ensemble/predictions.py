@@ -1,103 +1,99 @@
-"""What a way to run a scene will take and how far it will be off: counted work, and each method's own theory."""
+"""How far a way to run a scene will be off, by each method's own theory, and what it will cost on a nominal core."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import torch
 
 from torchchain.chain.amplitude import elongation_estimate, force_deviation
+from torchchain.chain.chain import Chain
 from torchchain.chain.excitation import Impulse
 from torchchain.chain.states import State
-from torchchain.ensemble.layout import layout
-from torchchain.ensemble.machine import Machine, kernels_loaded
-from torchchain.ensemble.observables import MOMENTS
-from torchchain.ensemble.reach import reach
-from torchchain.ensemble.scene import BAND_OBSERVABLES, Scene
+from torchchain.ensemble.moving_part import moving_part
+from torchchain.ensemble.observables import chosen_observables, is_fused
+from torchchain.ensemble.scene import Scene
+from torchchain.evolvers import METHODS, Method
 from torchchain.evolvers.drift import total
 from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, terms
 
 EPS = {torch.float64: 2.0**-53, torch.float32: 2.0**-24}
-SAMPLE = 4  # realizations that stand for the ensemble
-SAMPLE_SIZE = 2**16  # particles in them
-STEPPERS = {"verlet": (2, 1 / 24, 1, 2.0), "symplectic4": (4, 6e-5, 4, 2.98944)}  # order, phase error, forces, limit
-# Elementwise passes over a state that an observable takes where the kernels do not measure it themselves.
-PASSES = {
-    "band_energy": 30, "center": 18, "displacement": 2, "dissipated": 0, "energy": 16, "openings": 0, "source_energy": 14,
-    "total_energy": 12, "wavenumber_energy": 30, "width": 22,
-}  # fmt: skip
+SAMPLE = 2**17  # particles of the chains, and of the starts, that stand for the ensemble: some 20 ms
+TAIL = 8  # of the softest and stiffest particles, from which those of chains not drawn are extrapolated
 
 
 class Facts:
-    """What the predictions need to know of a scene, from a few of its chains.
+    """What the predictions need to know of a scene, from its first chains: all of them, where they are few.
 
     Attributes:
-        n: particles that are computed, those that the wave reaches where the rest is cut off.
-        reach: their range, or None for the whole chain.
+        n: particles that are computed.
         rows: starts per chain.
         chains: realizations that are computed, one where all are the same.
-        typical: highest frequency of a chain.
-        limit: frequency that is not expected to be exceeded in the whole ensemble.
+        typical: highest frequency of a chain, their mean.
+        limit: frequency that no chain of the ensemble is expected to exceed.
         elongation, deviation: largest of the start, and of the Hertz force from the linear there.
         gaps: times from each output to the next, (time,).
     """
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self.reach = reach(scene)
-        inner = scene if self.reach is None else self.reach.scene(scene)
-        self.n = inner.n_particles
-        self.rows = max(1, len(scene.tones))
-        self.chains = scene.distinct_realizations
-        sampled = max(1, min(SAMPLE, self.chains, SAMPLE_SIZE // self.n))
-        chain = inner.chain(range(sampled))
-        state = inner.state(chain)
-        self.elongation = float(elongation_estimate(chain, state).max())
+        self.part = moving_part(scene)
+        inner = scene if self.part is None else self.part.scene(scene)
+        self.n, self.rows, self.chains = inner.n_particles, max(1, len(scene.tones)), scene.distinct_realizations
+        sampled = max(1, min(self.chains, SAMPLE // scene.n_particles))
+        chain = scene.chain(range(sampled))
+        if self.part is not None:
+            chain = self.part.chain(chain)
+        bounds = chain.squared_frequency_bound(sweeps=8).sqrt()
+        few = max(1, SAMPLE // (self.rows * self.n))
+        few = min(few, sampled)
+        stiffness = chain.contact_stiffness[:few]
+        self._linear = Chain(chain.masses[:few], inner.boundary, stiffness)
+        self._state = inner.state(self._linear)
+        self.elongation = float(elongation_estimate(self._linear, self._state).max())
         self.deviation = float(force_deviation(torch.tensor(self.elongation, dtype=torch.float64)))
         self.gaps = torch.cat([scene.times[:1], scene.times.diff()])
         self.end = float(scene.times[-1])
-        bounds = chain.squared_frequency_bound(sweeps=8).sqrt()
-        self.typical, self.limit = float(bounds.mean()), self._limit(scene, float(bounds.max()))
-        self._linear, self._state = replace(chain, contact="linear", damping=0.0), state
+        self.typical = float(bounds.mean())
+        self.limit = float(bounds.max()) * _growth_of_maximum(chain, self.chains / sampled)
+        if scene.contact == "hertz":
+            self.limit *= (1 + self.elongation) ** 0.25
         self._frequencies: dict[int, float] = {}
         self.impulse = isinstance(scene.excitation, Impulse)
         later = self.gaps[self.gaps > 0]
         self.uniform = len(later) > 0 and bool((later - later[0]).abs().max() <= 1e-9 * self.end)
+        self.observables = chosen_observables(scene.observables)
 
     @property
-    def count(self) -> int:
-        """Output times."""
-        return len(self.gaps)
+    def accumulated(self) -> float:
+        """What leaving out the nonlinearity of Hertz contacts does to energies by the last time.
 
-    def _limit(self, scene: Scene, bound: float) -> float:
-        """The first chains' bound, or that of the lightest particle to expect among average ones, with a margin."""
-        draws = max(2.0, 1.0 * self.chains * self.n)
-        lightest = float(scene.disorder._quantile(torch.tensor([1 / draws], dtype=torch.float64).numpy())[0])
-        single = math.sqrt(4 / (lightest * (2 - lightest))) if lightest < 1 else 2.0
-        limit = max(bound, single) * (1.0 if scene.is_ordered else 1.1)
-        return limit * (1 + self.elongation) ** 0.25 if scene.contact == "hertz" else limit
+        The force is off by ``deviation``, and phases by that share of w t while the elongation lasts. A pulse spreads:
+        its elongation starts at about half and falls as t^(-1/3), the front's, down to what disorder localizes.
+        """
+        w = min(self.frequency(1), self.typical)
+        lasting = self.end
+        if self.impulse:
+            kinds = self.scene.disorder, self.scene.stiffness_disorder
+            localized = min(1.0, max(kind.strength for kind in kinds if kind is not None))
+            lasting = 0.5 * max(1.5 * ((1 + self.end) ** (2 / 3) - 1), localized * self.end)
+        return self.deviation * (1 + 0.5 * w * lasting)
 
     def frequency(self, power: int) -> float:
         """The mean of w^power over the start, in the norm of the energy: |G^power x| / |x|, with dx/dt = G x.
 
         The shares of the modes never change in a linear chain, so that this is what a phase error in w^power does
-        at all times. A wave in Hertz contacts makes harmonics, up to the highest frequency of the ordered chain.
+        at all times. A wave in Hertz contacts makes harmonics, in the end at all frequencies alike.
         """
-        if power in self._frequencies:
-            return self._frequencies[power]
-        state = self._state
-        first = total(self._linear, state.displacement, state.velocity)
-        for _ in range(power):
-            force = self._linear.force(state.displacement)
-            state = State(state.velocity, force / self._linear.align(self._linear.masses, force))
-        mean = float((total(self._linear, state.displacement, state.velocity) / first).mean(0).max().sqrt())
-        if self.scene.contact == "hertz":
-            harmonics = min(1.0, self.deviation * self.end * mean ** (1 / power))
-            mean = max(mean, harmonics * 2.0**power) * (1 + self.elongation) ** (power / 4)
-        self._frequencies[power] = mean
-        return mean
+        if power not in self._frequencies:
+            mean = _mean_power(self._linear, self._state, power)
+            if self.scene.contact == "hertz":
+                harmonics = min(1.0, self.deviation * self.end * mean ** (1 / power))
+                mean = max(mean, 2 * harmonics * _mean_power(self._linear, _white(self._linear), power))
+                mean *= (1 + self.elongation) ** (power / 4)
+            self._frequencies[power] = mean
+        return self._frequencies[power]
 
     @property
     def cancellation(self) -> float:
@@ -106,8 +102,8 @@ class Facts:
         A wave of small k has 1 / k; a ring that is struck moves on as a whole, by v t / N against some v / sqrt(N).
         """
         largest = float(self._state.displacement.abs().max()) / (10 * self.elongation)
-        drift = self.end / math.sqrt(self.n) if self.impulse and self.scene.boundary == "periodic" else 0.0
-        return max(1.0, largest, drift)
+        whole = self.end / math.sqrt(self.n) if self.impulse and self.scene.boundary == "periodic" else 0.0
+        return max(1.0, largest, whole)
 
     @property
     def growing(self) -> float:
@@ -115,23 +111,15 @@ class Facts:
         return self.end if self.scene.damping == 0 else min(self.end, 1 / self.scene.damping)
 
     @property
-    def bands(self) -> bool:
-        return bool(BAND_OBSERVABLES & set(self.scene.observables))
+    def bands_alone(self) -> bool:
+        """Whether band energies are all that is measured in time."""
+        return {entry.kernel for entry in self.observables if entry.in_time} == {"bands"}
 
-    @property
-    def in_time(self) -> list[str]:
-        """The observables that need the states at the output times."""
-        return [name for name in self.scene.observables if name in PASSES]
-
-    def fused(self) -> bool:
-        """Whether the stencil's kernels can measure the observables themselves."""
-        return MOMENTS.issuperset(self.in_time) or self.in_time == ["band_energy"]
-
-    def moving(self, ahead: float) -> float:
+    def moving(self, ahead: float = 0.0) -> float:
         """Mean over time of the particles that the stencil touches, ``ahead`` beyond those that move."""
-        if not self.impulse:
+        if not isinstance(self.scene.excitation, Impulse):
             return float(self.n)
-        site, n = self.scene.excitation.site, self.scene.n_particles  # type: ignore[union-attr]
+        site, n = self.scene.excitation.site, self.scene.n_particles
         t = torch.linspace(0, self.end, 65, dtype=torch.float64)
         front = t + 4 * (1 + t) ** (1 / 3) + ahead
         if self.scene.boundary == "fixed":
@@ -141,19 +129,47 @@ class Facts:
         return float(width.mean())
 
 
+def _growth_of_maximum(chain: Chain, more: float) -> float:
+    """By how much the highest frequency of so many times more chains exceeds that of these.
+
+    The tail of Gershgorin's bound 2 (kappa + kappa') / m over the particles, as a power law (Hill 1975).
+    """
+    if more <= 1:
+        return 1.0
+    stiffness = chain.contact_stiffness
+    right = stiffness.roll(-1, -1) if chain.boundary == "periodic" else stiffness[..., 1:]
+    local = ((stiffness[..., : chain.n_particles] + right) / chain.masses).flatten()
+    top = local.topk(min(TAIL, len(local))).values.log()
+    return 1.1 * float(torch.exp((top - top[-1]).mean() * math.log(more) / 2))
+
+
+def _white(chain: Chain) -> State:
+    """A start in which all modes have the same energy on average: velocities of random signs, kinetic energies alike."""
+    signs = torch.randint(0, 2, chain.masses.shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    return State(torch.zeros_like(chain.masses), signs / chain.masses.sqrt())
+
+
+def _mean_power(chain: Chain, state: State, power: int) -> float:
+    first = total(chain, state.displacement, state.velocity)
+    for _ in range(power):
+        force = chain.force(state.displacement)
+        state = State(state.velocity, force / chain.align(chain.masses, force))
+    return float((total(chain, state.displacement, state.velocity) / first).mean(0).max().sqrt())
+
+
 # --------------------------------------------------------------------------------------------------------------- errors
 
 
 def settle(method: str, facts: Facts, tolerance: float, dtype: torch.dtype) -> tuple[dict[str, Any], float]:
     """The coarsest options of a method that keep to the tolerance, and the error predicted for them."""
-    options: dict[str, Any] = {}
-    if method == "chebyshev":
+    entry, options = METHODS[method], {}
+    if "accuracy" in entry.options:
         options = {"accuracy": max(1e-13, min(1e-4, tolerance / 20))}
-    elif method == "dopri8":
-        options = {"rtol": max(1e-13, min(1e-4, 0.5 * tolerance / _growth(facts)))}
-    elif method in STEPPERS:
-        order, _, _, limit = STEPPERS[method]
-        step = min((0.9 * tolerance / _step_error(method, facts)) ** (1 / order), 0.7 * limit / facts.limit)
+    elif "rtol" in entry.options:
+        options = {"rtol": max(1e-13, min(1e-4, 0.5 * tolerance / _adaptive_growth(facts)))}
+    elif entry.order_in_step is not None:
+        step = (0.9 * tolerance / _step_error(entry, facts)) ** (1 / entry.order_in_step)
+        step = min(step, 0.7 * (entry.stability_limit or math.inf) / facts.limit)
         if facts.scene.damping > 0:
             step = min(step, 0.7 / (facts.scene.damping * facts.limit**2))
         options = {"step": min(step, facts.end or 1.0)}
@@ -162,167 +178,142 @@ def settle(method: str, facts: Facts, tolerance: float, dtype: torch.dtype) -> t
 
 def error_of(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype) -> float:
     """Predicted error of a method, relative to the scale of the observables."""
-    eps, phase = EPS[dtype], facts.limit * facts.end
-    if method in STEPPERS:
-        order, _, forces, _ = STEPPERS[method]
-        walk = math.sqrt(forces * facts.end / options["step"])  # of the rounding errors of the steps
-        return _step_error(method, facts) * options["step"] ** order + eps * (100 + 20 * walk) * facts.cancellation
-    if method == "dopri8":
-        return _growth(facts) * options["rtol"] + eps * (100 + 40 * phase)
+    entry, eps, phase = METHODS[method], EPS[dtype], facts.limit * facts.end
+    if entry.order_in_step is not None:
+        walk = math.sqrt(entry.forces_per_step * facts.end / options["step"])  # of the rounding errors of the steps
+        truncation = _step_error(entry, facts) * options["step"] ** entry.order_in_step
+        return truncation + eps * (100 + 20 * walk) * facts.cancellation
+    if "rtol" in entry.options:
+        return _adaptive_growth(facts) * options["rtol"] + eps * (100 + 40 * phase)
     local = 5 * options.get("accuracy", 0.0)  # that of the whole state may lie where the state is small
-    return local + eps * ((4000 if method == "damped" else 100) + 40 * phase)
+    return local + eps * (100 * max(1, entry.matrices) + 40 * phase)
 
 
-def _step_error(method: str, facts: Facts) -> float:
+def _step_error(entry: Method, facts: Facts) -> float:
     """Error per step^order: the phases' w^(order + 1) t where these matter, else the swing of the energy.
 
     Energies are off by twice what phases are, and the largest error of a field is larger than its mean.
     """
-    order, constant, _, _ = STEPPERS[method]
+    assert entry.order_in_step is not None
     if facts.scene.observables == ("total_energy",) and facts.scene.damping == 0:
-        return 18 * constant * facts.frequency(order)
+        return 18 * entry.phase_error * facts.frequency(entry.order_in_step)
     margin = 5 if "displacement" in facts.scene.observables else 3
-    return margin * constant * facts.frequency(order + 1) * max(facts.growing, 1.0)
+    return margin * entry.phase_error * facts.frequency(entry.order_in_step + 1) * max(facts.growing, 1.0)
 
 
-def _growth(facts: Facts) -> float:
+def _adaptive_growth(facts: Facts) -> float:
     """Error of the adaptive method over its relative tolerance per step."""
     return 16 * max(1.0, facts.growing) * max(1.0, facts.frequency(1) / 2)
 
 
 # ---------------------------------------------------------------------------------------------------------------- costs
 
-
-def seconds(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
-    """Predicted wall time of a run: what every run takes, and the method's work spread over the cores."""
-    kernels = method in ("chebyshev", *STEPPERS)
-    cut = layout(facts.scene, method, facts.scene.observables, torch.device("cpu"))
-    chunks, workers = math.ceil(facts.chains / cut.size), min(cut.workers, machine.cores)
-    parallel = min(machine.cores, facts.rows) if facts.chains == 1 and kernels else 1
-    rounds = math.ceil(chunks / workers) * min(cut.size, facts.chains)
-    work = {
-        "modes": _modes, "tridiagonal": _modes, "chebyshev": _chebyshev, "verlet": _steps, "symplectic4": _steps,
-        "damped": _damped, "dopri8": _adaptive,
-    }[method]  # fmt: skip
-    each = work(method, facts, options, dtype, machine) / parallel
-    each += facts.scene.n_particles * machine.draw
-    if "long_time_band_energy" in facts.scene.observables:
-        each += facts.rows * facts.n**2 * 4 * machine.entry
-        if method != "modes":
-            each += _decomposition("modes", facts.n, machine)
-    once = machine.compilation or machine.loading * (not kernels_loaded()) if kernels else 0.0
-    calls = CALLS[method] + 40 * len(facts.in_time) + 300 * (facts.reach is not None)
-    python = (chunks * calls + facts.chains * CALLS["realization"]) * machine.call  # one thread's waits for the others'
-    return machine.run + once + rounds * each + python
+# Seconds on one core of a 2023 server (AMD EPYC). They rank the methods, the same on every machine; what a run takes here
+# is told by these times one measured ratio, see plan.speed.
+CALL = 1.0e-6  # one operation on a small tensor
+PASS = 2.6e-10  # an elementwise pass, per number
+FLOP = 2.1e-11  # of a product of matrices
+TRIG = 3.0e-9  # a cosine
+DRAW = 2.6e-8  # a particle
+DECOMPOSITION = {"modes": (6.0e-8, 1.6e-10), "tridiagonal": (6.3e-8, 2e-11), "damped": (9.3e-7, 1.4e-8)}  # per N^2, N^3
+STENCIL, SUM, MOMENT, TRANSFORM, BESSEL, START = (
+    2.2e-10,
+    1.2e-10,
+    5.0e-10,
+    6.0e-9,
+    5.2e-9,
+    1.9e-7,
+)  # kernels, per particle
+UPDATE = {"linear": (4.6e-10, 2.9e-10), "hertz": (1.3e-9, 5.3e-10)}  # drift and kick of a particle: float64, float32
+DAMP, LOOP = 1.2e-9, 2.9e-8  # contact damping over a step, per particle; starting a loop over a chain
+CALLS = 1200  # small operations of a chunk of chains
 
 
-# Small operations of a chunk, and of a realization in the statistics: counted as time over that of one operation.
-CALLS = {
-    "modes": 1200, "tridiagonal": 1200, "chebyshev": 650, "verlet": 2100, "symplectic4": 2100, "damped": 2400,
-    "dopri8": 2500, "realization": 100,
-}  # fmt: skip
+def cost(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, chunk: int) -> float:
+    """Seconds of a chain on one nominal core, in chunks of so many."""
+    entry, n = METHODS[method], facts.n
+    if "accuracy" in entry.options:
+        seconds = _chebyshev(facts, options["accuracy"])
+    elif "rtol" in entry.options:
+        steps = 0.3 * len(facts.gaps) + 0.27 * facts.end * options["rtol"] ** (-1 / 8)
+        seconds = steps * 13 * (120 * CALL / chunk + 400 * facts.rows * n * PASS) + _observing(facts)
+    elif entry.order_in_step is not None:
+        seconds = _steps(entry, facts, options["step"], dtype)
+    else:
+        seconds = _decomposed(entry, facts)
+    if any(not observable.in_time for observable in facts.observables):
+        seconds += 4 * facts.rows * n**2 * PASS + (_decomposition("modes", n) if method != "modes" else 0.0)
+    calls = CALLS + 40 * len(facts.observables) + 300 * (facts.part is not None)
+    return seconds + facts.scene.n_particles * DRAW + (calls / chunk + 100) * CALL
 
 
-def _decomposition(method: str, n: int, machine: Machine) -> float:
-    square, cube = (
-        (machine.tridiagonal_square, machine.tridiagonal_cube)
-        if method == "tridiagonal"
-        else (machine.modes_square, machine.modes_cube)
-    )
+def _decomposition(method: str, n: int) -> float:
+    square, cube = DECOMPOSITION.get(method, DECOMPOSITION["modes"])
     return square * n**2 + cube * n**3
 
 
-def _observing(facts: Facts, machine: Machine) -> float:
+def _observing(facts: Facts) -> float:
     """Observables of one chain from its states, transforms included, and their part in the statistics."""
-    states = facts.rows * facts.count * facts.n
-    passes = float(sum(PASSES[name] for name in facts.in_time))
-    if facts.bands or "wavenumber_energy" in facts.scene.observables:
+    passes = sum(observable.passes for observable in facts.observables if observable.in_time)
+    if any(observable.wavenumbers for observable in facts.observables):
         passes += 8 * math.log2(facts.n)
-    return states * passes * machine.entry
+    return facts.rows * len(facts.gaps) * facts.n * passes * PASS
 
 
-def _modes(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
-    n, states = facts.n, facts.rows * facts.count
-    spent = _decomposition(method, n, machine) + 2 * facts.count * n * machine.trig
-    if method == "modes" and facts.in_time == ["band_energy"] and facts.scene.energy_definition == "site":
+def _decomposed(entry: Method, facts: Facts) -> float:
+    n, count = facts.n, len(facts.gaps)
+    states = facts.rows * count * n
+    seconds = _decomposition(entry.name, n) + 2 * count * n * TRIG
+    if entry.damped:
+        return seconds + states * (20 * n * FLOP + 6 * TRIG + 20 * PASS) + _observing(facts)
+    if entry.name == "modes" and facts.bands_alone and facts.scene.energy_definition == "site":
         products = 3 if facts.scene.boundary == "periodic" and facts.scene.stiffness_disorder is None else 4
-        binning = 4 * (facts.scene.n_bands + 1)
-        spent += states * n * ((2 * products * n + binning) * machine.flop + 16 * machine.entry)
-        return spent + 12 * n * n * math.log2(n) * machine.entry
+        seconds += states * ((2 * products * n + 4 * (facts.scene.n_bands + 1)) * FLOP + 16 * PASS)
+        return seconds + 12 * n * n * math.log2(n) * PASS
     passes = 12 if facts.impulse else 6
-    return spent + states * n * (4 * n * machine.flop + passes * machine.entry) + _observing(facts, machine)
+    return seconds + states * (4 * n * FLOP + passes * PASS) + _observing(facts)
 
 
-def _chebyshev(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
-    accuracy = max(options["accuracy"], 1e-13)
-    gaps = facts.gaps[facts.gaps > 0].tolist()
-    fused = facts.fused()
-    if facts.uniform:
-        gaps, repeats = gaps[:1], len(gaps)
-    else:
-        repeats = 1
+def _steps(entry: Method, facts: Facts, step: float, dtype: torch.dtype) -> float:
+    count = float((facts.gaps / step * (1 - 1e-9)).ceil().sum())
+    update = UPDATE[facts.scene.contact][dtype == torch.float32]
+    work = count * entry.forces_per_step * (facts.n * update + LOOP)
+    if facts.scene.damping > 0:
+        work += count * (facts.n * DAMP + LOOP)
+    return facts.rows * (work + len(facts.gaps) * facts.n * 4 * PASS) + _observing(facts)
+
+
+def _chebyshev(facts: Facts, accuracy: float) -> float:
+    """Counted stencils, sums and Bessel functions of the segments that the times are cut into."""
+    gaps, points = facts.gaps[facts.gaps > 0], facts.rows * len(facts.gaps)
+    z = facts.typical * (gaps[:1] if facts.uniform else gaps)  # one stands for all that are equal
+    repeats = len(gaps) if facts.uniform else 1
+    fused = is_fused("chebyshev", facts.scene.observables)
     stencils = sums = orders = 0.0
     longest = 4.0
-    limit = facts.typical
-    for gap in gaps:
-        z = limit * gap
-        leaps = math.ceil(z / LEAP)
-        if leaps == 0:
-            continue
-        if z <= REACH and (facts.uniform or len(gaps) > 1):
-            outputs = min(LONGEST, max(1, int(REACH / z)), len(gaps) * repeats)
-        else:
-            outputs = 1
-        whole = terms(z / leaps if leaps > 1 else z * outputs, accuracy)
-        mean = terms(z / leaps if leaps > 1 else z * (outputs + 1) / 2, accuracy)
+    for phase in z.tolist():
+        leaps = math.ceil(phase / LEAP)
+        shared = phase <= REACH and len(gaps) > 1
+        outputs = min(LONGEST, max(1, int(REACH / phase)), len(gaps)) if shared else 1
+        whole = terms(phase / leaps if leaps > 1 else phase * outputs, accuracy)
+        mean = terms(phase / leaps if leaps > 1 else phase * (outputs + 1) / 2, accuracy)
         # An impulse has no displacement and a wave no velocity at first, and later the mirrored states may be at hand.
         mirrored = fused and facts.uniform and leaps == 1
-        segments = len(gaps) * repeats * leaps / outputs
-        both = 1.0 if mirrored else 2 - 1 / max(1.0, segments)
+        both = 1.0 if mirrored else 2 - 1 / max(1.0, len(gaps) * leaps / outputs)
         stencils += repeats * leaps * both * whole / outputs
         sums += repeats * leaps * both * mean
-        orders += 0 if mirrored else repeats * leaps * (z / leaps * outputs + 60)
+        orders += 0 if mirrored else repeats * leaps * (phase / leaps * outputs + 60)
         longest = max(longest, whole)
-    cut = facts.reach is not None and facts.reach.pays(fused)
-    whole_chain = facts.n if cut else facts.scene.n_particles
-    if cut and fused:  # the check
-        stencils, sums = (
-            work + math.ceil(limit * facts.end / LEAP) * terms(LEAP, accuracy) for work in (stencils, sums)
-        )
+    part = moving_part(facts.scene, "chebyshev")
+    whole_chain = facts.scene.n_particles if part is None else part.size
+    if part is not None and fused:  # the check
+        check = math.ceil(facts.typical * facts.end / LEAP) * terms(LEAP, accuracy)
+        stencils, sums = stencils + check, sums + check
     size = facts.moving(longest / 2)
-    spent = facts.rows * (size * (stencils * machine.stencil + sums * machine.sum) + orders * machine.order)
-    spent += facts.rows * (stencils / 4 * machine.pass_call + whole_chain * machine.scratch)
-    spent += whole_chain * machine.layout
-    points = facts.rows * facts.count
+    seconds = facts.rows * (size * (stencils * STENCIL + sums * SUM) + orders * BESSEL + stencils / 4 * LOOP)
+    seconds += whole_chain * START * (0.75 + 0.25 * facts.rows)
     if not fused:
-        return spent + points * facts.n * 2 * machine.entry + _observing(facts, machine)
-    if facts.in_time == ["band_energy"]:
-        return spent + points * facts.n * machine.transform
-    return spent + points * size * machine.moment * bool(facts.in_time)
-
-
-def _steps(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
-    forces = STEPPERS[method][2]
-    count = float((facts.gaps / options["step"] * (1 - 1e-9)).ceil().sum())
-    hertz, half = facts.scene.contact == "hertz", dtype == torch.float32
-    update = machine.hertz if hertz else machine.update
-    if half:
-        update = machine.hertz_single if hertz else machine.update_single
-    work = count * forces * (facts.n * update + machine.pass_call)
-    if facts.scene.damping > 0:
-        work += count * (facts.n * machine.damping + machine.pass_call)
-    return facts.rows * (work + facts.count * facts.n * 4 * machine.entry) + _observing(facts, machine)
-
-
-def _damped(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
-    n, states = facts.n, facts.rows * facts.count
-    spent = machine.damped_square * n**2 + machine.damped_cube * n**3
-    spent += states * n * (20 * n * machine.flop + 6 * machine.trig + 20 * machine.entry)
-    return spent + _observing(facts, machine)
-
-
-def _adaptive(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, machine: Machine) -> float:
-    steps = 0.3 * facts.count + 0.27 * facts.end * options["rtol"] ** (-1 / 8)
-    cut = layout(facts.scene, method, facts.scene.observables, torch.device("cpu"))
-    calls = 120 * machine.call * min(cut.workers, machine.cores) / cut.size  # whose Python waits for the others'
-    return steps * 13 * (calls + 400 * facts.rows * facts.n * machine.entry) + _observing(facts, machine)
+        return seconds + points * facts.n * 2 * PASS + _observing(facts)
+    if facts.bands_alone:
+        return seconds + points * facts.n * TRANSFORM
+    return seconds + points * size * MOMENT * any(observable.in_time for observable in facts.observables)

@@ -10,24 +10,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
-from tqdm import tqdm
 
-from torchchain import checks
+from torchchain import checks, progress
 from torchchain.chain.amplitude import elongation_estimate, warn_if_nonlinear
 from torchchain.ensemble import plan as planning
-from torchchain.ensemble.checkpoint import Checkpoint, Kept, uninterrupted
+from torchchain.ensemble.checkpoint import Checkpoint, Kept, Writer, uninterrupted
 from torchchain.ensemble.chunk import Chunk
-from torchchain.ensemble.layout import layout
-from torchchain.ensemble.observables import is_fused
+from torchchain.ensemble.layout import Layout, layout
 from torchchain.ensemble.ranks import ALONE, Ranks
-from torchchain.ensemble.reach import reach
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.statistics import EnsembleMoments, merged
@@ -36,6 +33,57 @@ from torchchain.threads import map_in_order, single_thread
 
 Measured = TypeVar("Measured")
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A scene with all that is settled before its first chain is drawn.
+
+    Attributes:
+        scene: its contact law settled.
+        method, options: of the evolution, ``dtype`` among the options.
+        layout: what goes through a product together, on which device.
+    """
+
+    scene: Scene
+    method: str
+    options: dict[str, Any]
+    layout: Layout
+
+    def chunk(self, numbers: range, stages: Stages) -> Chunk:
+        """The realizations of these numbers, drawn and set in motion."""
+        options = dict(self.options)
+        dtype = PRECISIONS[options.pop("dtype", "float64")]
+        with single_thread(), stages("masses"):
+            chain = self.scene.chain(numbers, self.layout.device, dtype)
+            state = self.scene.state(chain)
+        return Chunk(self.scene, numbers[0], chain, state, self.method, options, self.layout, stages)
+
+
+def check_settings(scene: Scene, method: str, options: Any, device: str | torch.device) -> torch.device:
+    """The device; an error, before the plan draws a chain, for what no run of the scene can do."""
+    checks.instance("scene", scene, Scene)
+    checks.choice("method", method, ("auto", *METHODS))
+    checks.instance("options", options, dict, type(None))
+    checks.choice("dtype", (options or {}).get("dtype", "float64"), PRECISIONS)
+    device = checks.device("device", device)
+    layout(scene, method, device)
+    return device
+
+
+def prepared(scene: Scene, method: str, options: dict[str, Any], device: torch.device) -> Run:
+    """The run of a scene by a method."""
+    check_amplitude(scene)
+    return Run(scene, method, options, layout(scene, method, device))
+
+
+def chosen(scene: Scene, method: str, options: dict[str, Any] | None = None) -> tuple[str, dict[str, Any]]:
+    """The method and its options, the plan's where they are left to it."""
+    options = dict(options or {})
+    if method != "auto":
+        return method, options
+    plan = planning.plan(scene)
+    return plan.method, {**plan.run_options, **options}
 
 
 def stream(
@@ -48,7 +96,6 @@ def stream(
     progress: bool = False,
     stages: Stages | None = None,
     options: dict[str, Any] | None = None,
-    names: Sequence[str] | None = None,
     numbers: Sequence[range] | None = None,
 ) -> Iterator[tuple[int, Measured]]:
     """Measure the realizations of a scene in chunks that keep to a memory budget, in order.
@@ -66,7 +113,6 @@ def stream(
         progress: show a bar if the output is a terminal.
         stages: collects seconds per stage.
         options: the method's own, and ``dtype``, "float64" or "float32".
-        names: observables that ``measure`` takes; by default the scene's.
         numbers: realizations to measure, as ranges in order, their starts multiples of the layout's ``group``; by
             default all.
 
@@ -76,38 +122,34 @@ def stream(
     Raises:
         FieldError: also if one realization at a time takes more memory than there is.
     """
-    checks.choice("method", method, ("auto", *METHODS))
-    device = checks.device("device", device)
+    device = check_settings(scene, method, options, device)
+    scene = planning.resolved(scene)
+    run = prepared(scene, *chosen(scene, method, options), device)
+    yield from _measured(run, measure, numbers, memory_budget, progress, stages or Stages())
+
+
+def _measured(
+    run: Run, measure: Callable[[Chunk], Measured], numbers: Sequence[range] | None, memory_budget: int | None,
+    shown: bool, stages: Stages,
+) -> Iterator[tuple[int, Measured]]:  # fmt: skip
+    """:func:`stream` of a prepared run."""
     if memory_budget is not None:
         checks.integer("memory_budget", memory_budget, 1)
-    names = scene.observables if names is None else names
-    layout(scene, method, names, device)  # before the plan draws a chain
-    scene = planning.resolved(scene)
-    method, options = chosen(scene, method, options, names)
-    dtype = PRECISIONS[checks.choice("dtype", options.pop("dtype", "float64"), PRECISIONS)]
-    stages = stages or Stages()
-    check_amplitude(scene)
-    if numbers is None:
-        numbers = [range(scene.distinct_realizations)]
+    every = run.scene.distinct_realizations
+    numbers = [range(every)] if numbers is None else numbers
     wanted = sum(map(len, numbers))
-    plan = layout(scene, method, names, device, wanted, memory_budget)
-    times, part = scene.times.to(device), reach(scene)
+    cut = run.layout.chunks(wanted, memory_budget)
 
     def work(numbers: range) -> tuple[range, Measured, dict[str, float]]:
-        spent = Stages(1 / plan.workers)
-        with single_thread(), spent("masses"):
-            chain = scene.chain(numbers, device, dtype)
-            state = scene.state(chain)
-        chunk = Chunk(scene, numbers[0], chain, state, method, options, times, plan.window, plan.group, spent, part)
-        if device.type == "cpu" and is_fused(method, names):  # the kernels' bits do not depend on threads
+        spent = Stages(1 / cut.workers)
+        chunk = run.chunk(numbers, spent)
+        if run.layout.fused:  # the kernels' bits do not depend on threads
             return numbers, measure(chunk), spent.seconds
         with single_thread():
             return numbers, measure(chunk), spent.seconds
 
-    begun = scene.distinct_realizations - wanted
-    hidden = None if progress else True
-    with tqdm(total=begun + wanted, initial=begun, unit="chain", disable=hidden, leave=False) as bar:
-        for done, measured, seconds in map_in_order(work, _chunks(numbers, plan.size), plan.workers):
+    with progress.bar("chains", every, "chain", shown, every - wanted) as bar:
+        for done, measured, seconds in map_in_order(work, _chunks(numbers, cut.size), cut.workers):
             stages.add(seconds)
             yield done[0], measured
             bar.update(len(done))
@@ -121,17 +163,6 @@ def _chunks(numbers: Sequence[range], size: int) -> Iterator[range]:
             last = min(part.stop, (first // size + 1) * size)
             yield range(first, last)
             first = last
-
-
-def chosen(
-    scene: Scene, method: str, options: dict[str, Any] | None = None, names: Sequence[str] | None = None
-) -> tuple[str, dict[str, Any]]:
-    """The method and its options, the plan's for the observables of these names where they are left to it."""
-    options = dict(options or {})
-    if method != "auto":
-        return method, options
-    plan = planning.plan(scene if names is None else replace(scene, observables=tuple(names)))
-    return plan.method, {**plan.run_options, **options}
 
 
 def check_amplitude(scene: Scene) -> None:
@@ -161,82 +192,89 @@ class Ensemble:
     @property
     def attributes(self) -> dict[str, Any]:
         """``mass_mean`` and ``mass_sd`` over all particles of all realizations, ``method`` and ``method_options``."""
-        notes = {"method": self.method, "method_options": json.dumps(self.options, default=checks.shown)}
-        return realized_masses(self.moments) | notes
+        mean, square = merged(self.moments.blocks("mass_moments")).mean.tolist()
+        return {
+            "mass_mean": mean,
+            "mass_sd": max(0.0, square - mean**2) ** 0.5,
+            "method": self.method,
+            "method_options": json.dumps(self.options, default=checks.shown),
+        }
 
 
 def ensemble_moments(
     scene: Scene,
-    measure: Callable[[Chunk], dict[str, Tensor]],
     method: str = "auto",
     n_blocks: int = 1,
     *,
-    names: Sequence[str],
     options: dict[str, Any] | None = None,
     device: str | torch.device = "cpu",
+    memory_budget: int | None = None,
     stages: Stages | None = None,
     progress: bool = False,
     checkpoint: Checkpoint | str | Path | None = None,
     ranks: Ranks = ALONE,
-    **settings: Any,
 ) -> Ensemble:
-    """Moments over an ensemble of named measurements (realization, ...), and of the masses under "mass_moments".
+    """Moments over an ensemble of the scene's observables, and of the masses under "mass_moments".
 
     Args:
-        scene, method, options, device, stages, progress: see :func:`stream`.
-        measure: from a chunk to the measurements called ``names``.
+        scene: what is wanted, its contact law settled.
+        method, options, device, memory_budget, stages, progress: see :func:`stream`.
         n_blocks: of consecutive samples (realizations, or opposite pairs of them) whose moments are kept apart.
         checkpoint: keeps finished realizations, and those of an earlier run are not computed again.
         ranks: processes that share the realizations; each gets the result.
-        settings: see :func:`stream`.
     """
-    realizations = scene.distinct_realizations
-    cut = realizations, n_blocks, scene.sample_size
-    device, stages = checks.device("device", device), stages or Stages()
-    checks.instance("options", options, dict, type(None))
-    checks.choice("method", method, ("auto", *METHODS))
-    layout(scene, method, names, device)
+    device, stages = check_settings(scene, method, options, device), stages or Stages()
     if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
         checkpoint = Checkpoint(checkpoint)
+    cut = scene.distinct_realizations, n_blocks, scene.sample_size
     identity = {
-        "measured": list(names), "blocks": n_blocks, **scene.to_dict(),
+        "measured": list(scene.observables), "blocks": n_blocks, **scene.to_dict(),
         "method": method, "options": options or {}, "device": device.type,
     }  # fmt: skip
-    kept = Kept(EnsembleMoments(*cut))
-    begin: Any = None
-    if ranks.rank == 0:
-        try:
-            if checkpoint is not None:
-                kept = checkpoint.read(identity, *cut)
-            plan = kept.plan
-            if plan is None:
-                plan = dict(zip(("method", "options"), chosen(scene, method, names=names), strict=True))
-            begin = plan, kept.session, _missing(kept.moments.held(), realizations)
-        except (checks.FieldError, checks.FieldTypeError) as error:
-            begin = error
-    begin = ranks.agree(begin)
-    if isinstance(begin, Exception):
-        raise begin
-    plan, session, missing = begin
-    method, options = plan["method"], {**plan["options"], **(options or {})}
-    total = EnsembleMoments(*cut)
-    writer = checkpoint.writer(session, ranks.rank, identity, plan) if checkpoint is not None else None
+    with ExitStack() as held:
+        # Rank 0 reads what was kept and chooses; every rank follows.
+        kept, begin = Kept(EnsembleMoments(*cut)), None
+        if ranks.rank == 0:
+            try:
+                if checkpoint is not None:
+                    held.enter_context(checkpoint.lock())
+                    kept = checkpoint.read(identity, *cut)
+                plan = kept.plan or dict(zip(("method", "options"), chosen(scene, method), strict=True))
+                begin = plan, kept.session, _missing(kept.moments.held(), scene.distinct_realizations)
+            except (checks.FieldError, checks.FieldTypeError) as error:
+                begin = error
+        begin = ranks.agree(begin)
+        if isinstance(begin, Exception):
+            raise begin
+        plan, session, missing = begin
+        run = prepared(scene, plan["method"], {**plan["options"], **(options or {})}, device)
+        writer = checkpoint.writer(session, ranks.rank, identity, plan) if checkpoint is not None else None
+        own = ranks.share(missing, run.layout.group)
+        parts = _measured(
+            run, lambda chunk: _moments_of(chunk, cut), own, memory_budget, progress and ranks.rank == 0, stages
+        )
+        total = ranks.total(_collected(parts, EnsembleMoments(*cut), writer, stages, waits=ranks.size > 1))
+        if ranks.rank == 0:
+            total.absorb(kept.moments)
+        return Ensemble(ranks.everywhere(total), run.method, run.options)
 
-    def reduced(chunk: Chunk) -> EnsembleMoments:
-        measured = {name: values.cpu().double() for name, values in measure(chunk).items()}
-        masses = chunk.chain.masses.cpu().numpy()  # NumPy sums each row by itself
-        moments = np.stack([masses.mean(-1), np.square(masses).mean(-1)], axis=-1)
-        measured["mass_moments"] = torch.from_numpy(moments)
-        part = EnsembleMoments(*cut)
-        with chunk.stages("statistics"):
-            part.add(chunk.first, measured)
-        return part
 
-    own = ranks.share(missing, layout(scene, method, names, device).group)
-    parts = stream(
-        scene, reduced, method, options=options, device=device, stages=stages, names=names, numbers=own,
-        progress=progress and ranks.rank == 0, **settings,
-    )  # fmt: skip
+def _moments_of(chunk: Chunk, cut: tuple[int, int, int]) -> EnsembleMoments:
+    """A chunk's observables and masses, reduced."""
+    measured = {name: values.cpu().double() for name, values in chunk.observe(chunk.scene.observables).items()}
+    masses = chunk.chain.masses.cpu().numpy()  # NumPy sums each row by itself
+    measured["mass_moments"] = torch.from_numpy(np.stack([masses.mean(-1), np.square(masses).mean(-1)], axis=-1))
+    part = EnsembleMoments(*cut)
+    with chunk.stages("statistics"):
+        part.add(chunk.first, measured)
+    return part
+
+
+def _collected(
+    parts: Iterator[tuple[int, EnsembleMoments]], total: EnsembleMoments, writer: Writer | None, stages: Stages,
+    waits: bool,
+) -> EnsembleMoments:  # fmt: skip
+    """The moments of all parts, saved now and then; what is finished is kept when the run is stopped or fails."""
     try:
         for _, part in parts:
             with uninterrupted():
@@ -245,29 +283,20 @@ def ensemble_moments(
                 if writer is not None and writer.due:
                     with stages("checkpoint"):
                         writer.save(total)
-        if writer is not None and ranks.size > 1:
-            writer.close(total)  # the others may take long
+        if writer is not None and waits:
+            writer.close(total)  # the other ranks may take long
     except KeyboardInterrupt:
         if writer is None:
             raise
-        raise writer.interrupted(total, realizations) from None
+        raise writer.interrupted(total) from None
     except Exception:
         if writer is not None:
             writer.close(total)
         raise
-    total = ranks.total(total)
-    if ranks.rank == 0:
-        total.absorb(kept.moments)
-    return Ensemble(ranks.everywhere(total), method, options)
+    return total
 
 
 def _missing(held: Sequence[range], realizations: int) -> list[range]:
     """The realizations that are in none of the ranges, which are in order."""
     edges = [0, *(edge for part in held for edge in (part.start, part.stop)), realizations]
     return [range(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b]
-
-
-def realized_masses(moments: EnsembleMoments) -> dict[str, float]:
-    """``mass_mean`` and ``mass_sd`` over all particles of all realizations."""
-    mean, square = merged(moments.blocks("mass_moments")).mean.tolist()
-    return {"mass_mean": mean, "mass_sd": max(0.0, square - mean**2) ** 0.5}

@@ -21,30 +21,17 @@ from torchchain.chain.excitation import Impulse, StandingWave
 from torchchain.chain.scaling import Scaling
 from torchchain.chain.states import State
 from torchchain.energy.bands import center_tones, check_bands
+from torchchain.ensemble.observables import OBSERVABLES, chosen_observables
+from torchchain.ensemble.printed import Printed
 
-OBSERVABLES = (
-    "band_energy",
-    "center",
-    "displacement",
-    "dissipated",
-    "energy",
-    "long_time_band_energy",
-    "openings",
-    "source_energy",
-    "total_energy",
-    "wavenumber_energy",
-    "width",
-)
-BAND_OBSERVABLES = frozenset({"band_energy", "long_time_band_energy"})
-WAVENUMBER_OBSERVABLES = BAND_OBSERVABLES | {"wavenumber_energy"}
 EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse, "standing_wave": StandingWave}
 LARGEST_CHAIN = 10**8
 MOST_TIMES = 10**7
 LATEST_TIME = 1e12
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene(Printed):
     """An ensemble of chains, how they are set in motion, and what is to be measured. The defaults are the paper's.
 
     Attributes:
@@ -57,7 +44,7 @@ class Scene:
         realizations: chains in the ensemble.
         seed: realization i of it is the same chain in every run.
         tolerance: accuracy wanted for the observables, relative to their scale; None for the ensemble's own error.
-        observables: names from ``OBSERVABLES``.
+        observables: names from ``OBSERVABLES``, see :func:`torchchain.register_observable`.
         stiffness_disorder: of the contact stiffnesses; None for equal contacts.
         contact: "linear", "hertz", or "auto" for linear where the force of a linear contact is within the tolerance.
         damping: contact damping coefficient.
@@ -97,15 +84,11 @@ class Scene:
         put("realizations", checks.integer("realizations", self.realizations, 1, 10**9))
         put("seed", checks.integer("seed", self.seed, 0, 2**64 - 1))
         put("n_bands", checks.integer("n_bands", self.n_bands, 1))
-        for name, kinds in (("disorder", Disorder), ("excitation", (Impulse, StandingWave))):
-            if not isinstance(getattr(self, name), kinds):
-                raise checks.FieldTypeError(f"{name} must be a table, got {checks.shown(getattr(self, name))}")
-        if self.stiffness_disorder is not None and not isinstance(self.stiffness_disorder, Disorder):
-            raise checks.FieldTypeError(
-                f"stiffness_disorder must be a table, got {checks.shown(self.stiffness_disorder)}"
-            )
-        if self.si is not None and not isinstance(self.si, Scaling):
-            raise checks.FieldTypeError(f"si must be a table, got {checks.shown(self.si)}")
+        for name, kinds, example in _RECORDS:
+            value = getattr(self, name)
+            if not isinstance(value, kinds) and not (value is None and name in ("stiffness_disorder", "si")):
+                words = " or ".join(f"{'an' if kind is Impulse else 'a'} {kind.__name__}" for kind in kinds)
+                raise checks.FieldTypeError(f"{name} must be {words}, e.g. {example}, got {checks.shown(value)}")
         put("times", checks.times("times", self.times).to(torch.float64))
         late = self.times > LATEST_TIME
         checks.first_bad("times", f"be at most {LATEST_TIME:g}, where rounding blurs phases", self.times, late)
@@ -127,21 +110,46 @@ class Scene:
             check_bands(self.n_particles, self.n_bands)
             if isinstance(self.excitation, StandingWave):  # the center tone of the last band can be N/2
                 dataclasses.replace(self.excitation, tones=self.tones).check(self.n_particles)
-        for name in WAVENUMBER_OBSERVABLES.intersection(self.observables):
-            if self.contact == "hertz":
-                raise checks.fail("contact", f"be 'linear' for the observable {name}", repr(self.contact))
-            if self.energy_definition == "bond" and self.boundary == "fixed":
-                raise checks.fail("boundary", f"be 'periodic' for the observable {name} by 'bond'", repr(self.boundary))
+        for entry in chosen_observables(self.observables):
+            of = f"for the observable {entry.name}"
+            if entry.wavenumbers and self.contact == "hertz":
+                raise checks.fail("contact", f"be 'linear' {of}", repr(self.contact))
+            if entry.wavenumbers and self.energy_definition == "bond" and self.boundary == "fixed":
+                raise checks.fail("boundary", f"be 'periodic' {of} by 'bond'", repr(self.boundary))
+            if not entry.damped and self.damping > 0:
+                raise checks.fail("damping", f"be zero {of}", self.damping)
         if self.contact == "hertz" and self.energy_definition == "site":
             put("energy_definition", "bond")  # the only one that a Hertz contact has
-        if self.damping > 0 and "long_time_band_energy" in self.observables:
-            raise checks.fail("damping", "be zero for the observable long_time_band_energy", self.damping)
+
+    def _rows(self) -> dict[str, str]:
+        def words(record: Any) -> str:
+            plain = {name: value for name, value in _plain(record).items() if not isinstance(value, list)}
+            return ", ".join(f"{name} {value}" for name, value in plain.items())
+
+        wave = f"impulse: {words(self.excitation)}"
+        if isinstance(self.excitation, StandingWave):
+            wave = f"{_listed(self.tones, 'tone', 'tones')} of a standing wave: {words(self.excitation)}"
+        contacts = f"{self.contact}, damping {self.damping:g}"
+        if self.stiffness_disorder is not None:
+            contacts += f", stiffness disorder: {words(self.stiffness_disorder)}"
+        pairs = " in opposite pairs" if self.sample_size == 2 else ""
+        rows = {
+            "chains": f"{self.realizations}{pairs}, {self.boundary}, of {self.n_particles} particles, seed {self.seed}",
+            "disorder": words(self.disorder),
+            "contacts": contacts,
+            "excitation": wave,
+            "times": _listed(self.times.tolist(), "time", "times"),
+            "observables": ", ".join(self.observables) + (f"; {self.n_bands} bands" if self.needs_bands else ""),
+            "energy": f"by '{self.energy_definition}'",
+            "tolerance": "the ensemble's own error" if self.tolerance is None else f"{self.tolerance:g}",
+        }
+        return rows | ({"si": words(self.si)} if self.si is not None else {})
 
     @property
     def needs_bands(self) -> bool:
         """Whether ``n_bands`` matters: a band observable, or standing waves at the bands' center tones."""
         centers = isinstance(self.excitation, StandingWave) and self.excitation.tones is None
-        return centers or bool(BAND_OBSERVABLES & set(self.observables))
+        return centers or any(entry.bands for entry in chosen_observables(self.observables))
 
     @property
     def is_ordered(self) -> bool:
@@ -331,6 +339,21 @@ def _from_table(field_name: str, value: Any, kind: type) -> Any:
         if field_name != "stiffness_disorder":
             raise
         raise type(error)(f"stiffness_{error}") from None  # a Disorder calls itself disorder
+
+
+_RECORDS: tuple[tuple[str, tuple[type, ...], str], ...] = (
+    ("disorder", (Disorder,), "tc.Disorder(strength=0.3)"),
+    ("excitation", (Impulse, StandingWave), "tc.Impulse(site=1)"),
+    ("stiffness_disorder", (Disorder,), "tc.Disorder(strength=0.3)"),
+    ("si", (Scaling,), "tc.Scaling(...)"),
+)
+
+
+def _listed(values: Sequence[float], one: str, many: str) -> str:
+    """How many values, and from where to where."""
+    if len(values) == 1:
+        return f"{one} {values[0]:g}"
+    return f"{len(values)} {many} from {values[0]:g} to {values[-1]:g}"
 
 
 def describe(scene: Scene) -> str:

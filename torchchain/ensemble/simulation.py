@@ -7,13 +7,11 @@ from typing import Any
 
 import torch
 import xarray
-from torch import Tensor
 
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.checkpoint import Checkpoint
-from torchchain.ensemble.chunk import Chunk
 from torchchain.ensemble.labels import coordinates, ordered_error, scene_attributes
-from torchchain.ensemble.observables import IN_TIME
+from torchchain.ensemble.observables import chosen_observables
 from torchchain.ensemble.ranks import ALONE, Ranks
 from torchchain.ensemble.run import ensemble_moments
 from torchchain.ensemble.scene import Scene
@@ -48,18 +46,10 @@ def simulate(
         band), coordinates counted from 1, units in the attributes; realized mass moments in the attributes.
         A single realization of a disordered chain has the standard error infinity.
     """
-    scene, stages = planning.resolved(scene), stages or Stages()
-    in_time = [name for name in scene.observables if name in IN_TIME]
-
-    def measure(chunk: Chunk) -> dict[str, Tensor]:
-        measured = chunk.observe(in_time)
-        if "long_time_band_energy" in scene.observables:
-            measured["long_time_band_energy"] = chunk.long_time()
-        return measured
-
+    scene = planning.resolved(scene)
     ensemble = ensemble_moments(
-        scene, measure, method, names=scene.observables, device=device, memory_budget=memory_budget, progress=progress,
-        stages=stages, options=options, checkpoint=checkpoint, ranks=ranks,
+        scene, method, device=device, memory_budget=memory_budget, progress=progress, stages=stages, options=options,
+        checkpoint=checkpoint, ranks=ranks,
     )  # fmt: skip
     with single_thread():
         found = {name: merged(ensemble.moments.blocks(name)) for name in scene.observables}
@@ -70,17 +60,11 @@ def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, An
     leading = ("tone",) if scene.tones else ()
     variables: dict[str, Any] = {}
     used: set[str] = set()
-    for name, moment in moments.items():
-        entry = IN_TIME.get(name)
-        axes = leading + (entry.axes if entry else ("band",))
+    for entry in chosen_observables(scene.observables):
+        moment, axes = moments[entry.name], leading + entry.axes
         used.update(axes)
-        notes = {
-            "units": entry.unit if entry else "1",
-            "long_name": entry.long_name if entry else "infinite-time average of the share of the energy in a band",
-        }
-        variables[name] = (axes, moment.mean.numpy(), notes)
-        error = ordered_error(scene, moment)
-        variables[f"{name}_stderr"] = (
-            axes, error.numpy(), {**notes, "long_name": f"standard error of {notes['long_name']}"},
-        )  # fmt: skip
+        label = {"units": entry.unit, "long_name": entry.label}
+        error = {"units": entry.unit, "long_name": f"standard error of {entry.label}"}
+        variables[entry.name] = (axes, moment.mean.numpy(), label)
+        variables[f"{entry.name}_stderr"] = (axes, ordered_error(scene.is_ordered, moment).numpy(), error)
     return xarray.Dataset(variables, coords=coordinates(scene, used), attrs=scene_attributes(scene) | attributes)

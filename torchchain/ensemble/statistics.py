@@ -165,7 +165,7 @@ class EnsembleMoments:
     """
 
     def __init__(self, realizations: int, n_blocks: int = 1, sample_size: int = 1) -> None:
-        self.sample_size = sample_size
+        self.realizations, self.sample_size = realizations, sample_size
         self.edges = [realizations // sample_size * block // n_blocks for block in range(n_blocks + 1)]
         self.trees: dict[tuple[str, int], MomentTree] = {}
 
@@ -188,6 +188,11 @@ class EnsembleMoments:
         """Take in another part of the same ensemble, which is used up."""
         for (name, block), tree in other.trees.items():
             self._tree(name, block).absorb(tree)
+
+    @property
+    def names(self) -> set[str]:
+        """What was measured."""
+        return {name for name, _ in self.trees}
 
     def blocks(self, name: str) -> list[Moments]:
         """The moments of every block, in order."""
@@ -253,8 +258,7 @@ class EnsembleMoments:
 
     def again(self, plain: Mapping[str, Tensor]) -> EnsembleMoments:
         """Other moments of the same ensemble, see :meth:`from_tensors`."""
-        realizations, n_blocks = self.edges[-1] * self.sample_size, len(self.edges) - 1
-        return self.from_tensors(realizations, n_blocks, plain, self.sample_size)
+        return self.from_tensors(self.realizations, len(self.edges) - 1, plain, self.sample_size)
 
 
 def joined(ranges: Iterable[range]) -> list[range]:

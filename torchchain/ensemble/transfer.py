@@ -1,7 +1,10 @@
-"""The transfer of energy between wavenumber bands, averaged over an ensemble."""
+"""The transfer of energy between wavenumber bands, averaged over an ensemble: simulated, or from data of any origin."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,38 +16,60 @@ import xarray
 from torch import Tensor
 
 from torchchain import checks
+from torchchain._version import __version__
 from torchchain.chain.excitation import StandingWave
 from torchchain.energy.bands import band_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.checkpoint import Checkpoint
-from torchchain.ensemble.chunk import Chunk
-from torchchain.ensemble.labels import coordinates, ordered_error, scene_attributes
+from torchchain.ensemble.labels import ordered_error, scene_attributes, time_coordinates
 from torchchain.ensemble.layout import BLOCKS
+from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.ranks import ALONE, Ranks
-from torchchain.ensemble.run import Ensemble, ensemble_moments
-from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.run import ensemble_moments
+from torchchain.ensemble.scene import Scene, describe
 from torchchain.ensemble.stages import Stages
-from torchchain.ensemble.statistics import merged
+from torchchain.ensemble.statistics import EnsembleMoments, Moments, merged
 from torchchain.threads import single_thread
 
 
-@dataclass(frozen=True, eq=False)
-class BandTransfer:
+@dataclass(frozen=True)
+class Provenance:
+    """Where a band transfer comes from.
+
+    Attributes:
+        kind: "simulated" from a scene, or "imported".
+        words: for people.
+        hashes: SHA-256 by name of what it was made from.
+    """
+
+    kind: str = "imported"
+    words: str = ""
+    hashes: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        checks.instance("provenance.kind", self.kind, str)
+        checks.instance("provenance.words", self.words, str)
+        checks.instance("provenance.hashes", self.hashes, dict)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BandTransfer(Printed):
     """Band energies of an ensemble in which each band in turn is the source of a unit energy.
 
     Attributes:
-        scene: the ensemble; its tones hold one tone of every band, in order.
+        scene: the ensemble, its tones one of every band, in order; None for data from elsewhere.
         times: (time,).
         mean, stderr: share of the energy, [source, time, receiver].
-        long_time, long_time_stderr: infinite-time average, [source, receiver]; None if not asked for.
+        long_time, long_time_stderr: infinite-time average, [source, receiver]; None if not known.
         block_mean: means over consecutive blocks of realizations, [block, source, time, receiver].
         block_long_time: [block, source, receiver], or None.
         block_counts: realizations (of opposite ones, pairs) in each block.
-        attributes: realized mean and standard deviation of the masses, ``mass_mean`` and ``mass_sd``; the ``method`` that
-            evolved the chains and, as JSON, its ``method_options``.
+        attributes: of a simulation the realized mean and standard deviation of the masses, ``mass_mean`` and
+            ``mass_sd``, the ``method`` that evolved the chains and, as JSON, its ``method_options``.
+        provenance: where it comes from; of a simulation, left out, its scene.
     """
 
-    scene: Scene
+    scene: Scene | None
     times: Tensor
     mean: Tensor
     stderr: Tensor
@@ -54,12 +79,23 @@ class BandTransfer:
     block_long_time: Tensor | None
     block_counts: tuple[int, ...]
     attributes: dict[str, Any] = field(default_factory=dict)
+    provenance: Provenance | None = None
 
     def __post_init__(self) -> None:
-        checks.instance("scene", self.scene, Scene)
+        checks.instance("scene", self.scene, Scene, type(None))
         checks.instance("attributes", self.attributes, dict)
+        checks.instance("provenance", self.provenance, Provenance, type(None))
+        if self.provenance is None:
+            origin = Provenance()
+            if self.scene is not None:
+                scene_hash = hashlib.sha256(self.scene.to_toml().encode()).hexdigest()
+                origin = Provenance("simulated", describe(self.scene), {"scene": scene_hash})
+            object.__setattr__(self, "provenance", origin)
         object.__setattr__(self, "times", checks.times("times", self.times))
-        counts, n = self.block_counts, self.scene.n_bands
+        checks.instance("mean", self.mean, Tensor)
+        if self.mean.ndim != 3:
+            raise checks.fail("mean", "have the axes [source, time, receiver]", f"shape {tuple(self.mean.shape)}")
+        counts, n = self.block_counts, self.scene.n_bands if self.scene is not None else len(self.mean)
         if not isinstance(counts, (list, tuple)) or not counts:
             raise checks.FieldTypeError(f"block_counts must be a list of integers, got {checks.shown(counts)}")
         object.__setattr__(self, "block_counts", tuple(checks.integer("block_counts", c, 1) for c in counts))
@@ -86,29 +122,62 @@ class BandTransfer:
     def n_bands(self) -> int:
         return self.mean.shape[-1]
 
+    @property
+    def damping(self) -> float:
+        """Contact damping; 0 for data from elsewhere, whose shares of the energy are of that at each time."""
+        return 0.0 if self.scene is None else self.scene.damping
+
+    @property
+    def is_ordered(self) -> bool:
+        """Whether every realization is the same chain, so that there is no error of an ensemble."""
+        return self.scene is not None and self.scene.is_ordered
+
+    def _rows(self) -> dict[str, str]:
+        assert self.provenance is not None
+        known = "not known"
+        if self.long_time is not None and self.long_time_stderr is not None:
+            known = f"standard error up to {self.long_time_stderr.max():.1e}"
+        method = {"evolved by": str(self.attributes["method"])} if "method" in self.attributes else {}
+        return {
+            "origin": " ".join(filter(None, (f"{self.provenance.kind}:", self.provenance.words or "not told"))),
+            "axes": f"source {self.n_bands}, time {len(self.times)}, receiver {self.n_bands}",
+            "times": f"{self.times[0]:g} to {self.times[-1]:g}",
+            "samples": f"{sum(self.block_counts)} in {len(self.block_counts)} blocks",
+            "mean": f"standard error up to {self.stderr.max():.1e}",
+            "long_time": known,
+            **method,
+        }
+
     def to_dataset(self) -> xarray.Dataset:
         """Labeled axes and units, for netCDF; :meth:`from_dataset` reads it back."""
         s, t, r, b = "source", "time", "receiver", "block"
-        share = {"units": "1", "long_name": "share of the energy in the receiving band"}
-        variables: dict[str, Any] = {
-            "band_energy": ((s, t, r), self.mean.numpy(), share),
-            "band_energy_stderr": ((s, t, r), self.stderr.numpy(), {"units": "1", "long_name": "its standard error"}),
-            "block_band_energy": ((b, s, t, r), self.block_mean.numpy(), {"units": "1", "long_name": "block means"}),
-            "block_count": ((b,), np.array(self.block_counts), {"units": "1", "long_name": "realizations in a block"}),
-        }
+        variables: dict[str, Any] = {}
+
+        def put(name: str, axes: tuple[str, ...], values: Tensor, label: str) -> None:
+            variables[name] = (axes, values.numpy(), {"units": "1", "long_name": label})
+
+        put("band_energy", (s, t, r), self.mean, "share of the energy in the receiving band")
+        put("band_energy_stderr", (s, t, r), self.stderr, "its standard error")
+        put("block_band_energy", (b, s, t, r), self.block_mean, "block means")
+        put("block_count", (b,), torch.tensor(self.block_counts), "realizations in a block")
         if self.long_time is not None and self.long_time_stderr is not None and self.block_long_time is not None:
-            variables["long_time"] = (
-                (s, r), self.long_time.numpy(), {"units": "1", "long_name": "infinite-time average of the share"},
-            )  # fmt: skip
-            variables["long_time_stderr"] = ((s, r), self.long_time_stderr.numpy(), {"units": "1"})
-            variables["block_long_time"] = ((b, s, r), self.block_long_time.numpy(), {"units": "1"})
+            put("long_time", (s, r), self.long_time, "infinite-time average of the share")
+            put("long_time_stderr", (s, r), self.long_time_stderr, "its standard error")
+            put("block_long_time", (b, s, r), self.block_long_time, "block means")
         bands = np.arange(1, self.n_bands + 1)
         coords = {
-            **coordinates(self.scene, {"time"}),
+            **time_coordinates(self.times, self.scene.si if self.scene is not None else None),
             s: (s, bands, {"long_name": "band s of the initial standing wave"}),
             r: (r, bands, {"long_name": "receiving band r"}),
         }
-        return xarray.Dataset(variables, coords=coords, attrs=scene_attributes(self.scene) | self.attributes)
+        assert self.provenance is not None
+        origin = {
+            "provenance_kind": self.provenance.kind,
+            "provenance": self.provenance.words,
+            "provenance_hashes": json.dumps(self.provenance.hashes),
+        }
+        of_scene = {"torchchain_version": __version__} if self.scene is None else scene_attributes(self.scene)
+        return xarray.Dataset(variables, coords=coords, attrs=of_scene | self.attributes | origin)
 
     @classmethod
     def from_dataset(cls, data: xarray.Dataset) -> BandTransfer:
@@ -125,15 +194,11 @@ class BandTransfer:
                 raise checks.fail(
                     "data", f"hold the variable {name} of a band transfer", f"{', '.join(map(str, data))}"
                 )
-        for name in ("scene", "mass_mean", "mass_sd"):
-            if name not in data.attrs:
-                raise checks.fail("data", f"have the attribute {name} of a band transfer", "none")
-        try:
-            scene = Scene.from_dict(tomllib.loads(str(data.attrs["scene"])))
-        except (ValueError, RecursionError) as error:
-            raise checks.fail("data", "have the attribute scene of a band transfer", str(error)) from None
-        if "time" in data.coords and not np.array_equal(data["time"].values, scene.times.numpy()):
-            raise checks.fail("data", "have the times of its scene", checks.shown(data["time"].values))
+        attributes = {name: data.attrs[name] for name in ("method", "method_options") if name in data.attrs}
+        scene = None
+        if "scene" in data.attrs or "provenance_kind" not in data.attrs:
+            scene, moments = _scene_of(data)
+            attributes |= moments
 
         def tensor(name: str) -> Tensor:
             values = np.array(data[name].values)
@@ -144,7 +209,7 @@ class BandTransfer:
         held = "long_time" in data
         return cls(
             scene,
-            scene.times,
+            tensor("time") if scene is None else scene.times,
             tensor("band_energy"),
             tensor("band_energy_stderr"),
             tensor("long_time") if held else None,
@@ -152,9 +217,134 @@ class BandTransfer:
             tensor("block_band_energy"),
             tensor("block_long_time") if held else None,
             tuple(checks.integer("data.block_count", n, 1) for n in np.atleast_1d(data["block_count"].values)),
-            {name: checks.number(f"data.{name}", data.attrs[name]) for name in ("mass_mean", "mass_sd")}
-            | {name: str(data.attrs[name]) for name in ("method", "method_options") if name in data.attrs},
+            attributes,
+            _provenance_of(data),
         )
+
+    def save(self, path: str | Path) -> None:
+        """Write netCDF with labeled axes and units; the file appears whole or not at all.
+
+        Raises:
+            FieldError: if nothing can be written there.
+        """
+        checks.instance("path", path, str, Path)
+        path = Path(path)
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            self.to_dataset().to_netcdf(part, engine="h5netcdf")
+            os.replace(part, path)
+        except (OSError, ValueError) as error:
+            raise checks.fail("path", "be writable", f"{path}: {error}") from None
+        finally:
+            part.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | Path) -> BandTransfer:
+        """A band transfer from the file of :meth:`save`, or transfer.nc of a run.
+
+        Raises:
+            FieldError: if the file is not one.
+        """
+        checks.instance("path", path, str, Path)
+        try:
+            with xarray.open_dataset(path, engine="h5netcdf") as data:
+                return cls.from_dataset(data.load())
+        except (OSError, KeyError, RuntimeError) as error:
+            words = getattr(error, "strerror", None) or str(error).splitlines()[0]
+            raise checks.fail("path", "be a band transfer's netCDF file", f"{path}: {words}") from None
+
+    @classmethod
+    def from_energies(
+        cls, times: Any, energies: Any, long_time: Any = None, provenance: str | Provenance = ""
+    ) -> BandTransfer:
+        """A band transfer from band energies of any origin: experiments, or simulations of another code.
+
+        Args:
+            times: (time,), in travel times of sound over one particle.
+            energies: shares of the energy, (realization, source, time, receiver): where a unit energy that starts in
+                the band ``source`` is later.
+            long_time: infinite-time average, (source, receiver) if it is exact or (realization, source, receiver). By
+                default it is taken over the later half of the times; its standard error then holds the difference
+                between the two quarters, as what has not settled would give.
+            provenance: where the data come from, in words.
+
+        Returns:
+            BandTransfer whose scene is None; standard errors and blocks are those of the realizations.
+
+        >>> import torch, torchchain as tc
+        >>> times = torch.arange(0.0, 20.0)
+        >>> left = 0.5 + 0.5 * torch.exp(-0.3 * times)
+        >>> energy = torch.stack([torch.stack([left, 1 - left], -1), torch.stack([1 - left, left], -1)])
+        >>> tc.BandTransfer.from_energies(times, energy.expand(5, 2, 20, 2), provenance="two bands").n_bands
+        2
+
+        Raises:
+            FieldError, FieldTypeError: for times, shapes or numbers that are none of a transfer.
+        """
+        times, energies = checks.times("times", times), checks.real_tensor("energies", energies)
+        if energies.ndim != 4 or energies.shape[1] != energies.shape[3] or energies.shape[2] != len(times):
+            rule = f"have the axes (realization, source, time, receiver) with {len(times)} times and as many sources as receivers"
+            raise checks.fail("energies", rule, f"shape {tuple(energies.shape)}")
+        if not len(energies):
+            raise checks.fail("energies", "hold at least one realization", "none")
+        if not isinstance(provenance, Provenance):
+            checks.instance("provenance", provenance, str)
+            provenance = Provenance("imported", provenance)
+        energies, blocks = energies.detach().cpu().double(), min(BLOCKS, len(energies))
+        numbers = hashlib.sha256(energies.contiguous().numpy().tobytes() + times.double().numpy().tobytes())
+        provenance = replace(provenance, hashes={**provenance.hashes, "energies": numbers.hexdigest()})
+        average, unsettled = (
+            _late_average(times, energies) if long_time is None else _given_average(energies, long_time)
+        )
+        moments = EnsembleMoments(len(energies), blocks)
+        moments.add(0, {"band_energy": energies, "long_time_band_energy": average})
+        transfer = _from_moments(None, times.cpu().double(), moments, {}, provenance)
+        assert transfer.long_time_stderr is not None
+        return replace(transfer, long_time_stderr=(transfer.long_time_stderr.square() + unsettled.square()).sqrt())
+
+
+def _given_average(energies: Tensor, long_time: Any) -> tuple[Tensor, Tensor]:
+    """A given long-time average of every realization, and what else it may be off by: nothing."""
+    given = checks.real_tensor("long_time", long_time).cpu().double()
+    shape = (len(energies), energies.shape[1], energies.shape[3])
+    if tuple(given.shape) not in (shape, shape[1:]):
+        raise checks.fail("long_time", f"have shape {shape[1:]} or {shape}", f"shape {tuple(given.shape)}")
+    return given.expand(shape), torch.zeros(shape[1:], dtype=torch.float64)
+
+
+def _late_average(times: Tensor, energies: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean over the later half of the times of every realization, and half of how far its two quarters differ."""
+    late = energies[:, :, 2 * times >= times[-1]]
+    first, second = late.tensor_split(2, dim=2)
+    unsettled = (
+        (second.mean((0, 2)) - first.mean((0, 2))).abs() / 2 if first.shape[2] else torch.zeros(late.shape[1::2])
+    )
+    return late.mean(2), unsettled.double()
+
+
+def _scene_of(data: xarray.Dataset) -> tuple[Scene, dict[str, Any]]:
+    """The scene of a simulation's dataset, and the moments of its masses."""
+    for name in ("scene", "mass_mean", "mass_sd"):
+        if name not in data.attrs:
+            raise checks.fail("data", f"have the attribute {name} of a band transfer", "none")
+    try:
+        scene = Scene.from_dict(tomllib.loads(str(data.attrs["scene"])))
+    except (ValueError, RecursionError) as error:
+        raise checks.fail("data", "have the attribute scene of a band transfer", str(error)) from None
+    if "time" in data.coords and not np.array_equal(data["time"].values, scene.times.numpy()):
+        raise checks.fail("data", "have the times of its scene", checks.shown(data["time"].values))
+    return scene, {name: checks.number(f"data.{name}", data.attrs[name]) for name in ("mass_mean", "mass_sd")}
+
+
+def _provenance_of(data: xarray.Dataset) -> Provenance | None:
+    """What a dataset says of its origin; None in files written before they did."""
+    if "provenance_kind" not in data.attrs:
+        return None
+    try:
+        hashes = json.loads(str(data.attrs.get("provenance_hashes", "{}")))
+    except ValueError as error:
+        raise checks.fail("data", "have the attribute provenance_hashes as JSON", str(error)) from None
+    return Provenance(str(data.attrs["provenance_kind"]), str(data.attrs.get("provenance", "")), hashes)
 
 
 def band_transfer(
@@ -188,40 +378,38 @@ def band_transfer(
     """
     checks.truth("long_time", long_time)
     scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
-    long_time = long_time and scene.damping == 0
-    n_blocks = min(BLOCKS, scene.distinct_realizations // scene.sample_size)
-
-    def measure(chunk: Chunk) -> dict[str, Tensor]:
-        measured = chunk.observe(["band_energy"])
-        return measured | ({"long_time": chunk.long_time()} if long_time else {})
-
+    late = ("long_time_band_energy",) if long_time and scene.damping == 0 else ()
     ensemble = ensemble_moments(
-        scene, measure, method, n_blocks, names=("band_energy", *["long_time_band_energy"] * long_time), device=device,
-        memory_budget=memory_budget, progress=progress, stages=stages, options=options, checkpoint=checkpoint,
-        ranks=ranks,
+        replace(scene, observables=("band_energy", *late)), method,
+        min(BLOCKS, scene.distinct_realizations // scene.sample_size), device=device, memory_budget=memory_budget,
+        progress=progress, stages=stages, options=options, checkpoint=checkpoint, ranks=ranks,
     )  # fmt: skip
     with single_thread(), stages("statistics"):
-        return _transfer(scene, ensemble, long_time)
+        return _from_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None)
 
 
-def _transfer(scene: Scene, ensemble: Ensemble, long_time: bool) -> BandTransfer:
+def _from_moments(
+    scene: Scene | None, times: Tensor, moments: EnsembleMoments, attributes: dict[str, Any],
+    provenance: Provenance | None,
+) -> BandTransfer:  # fmt: skip
     """The BandTransfer of the blocks' moments in time and at infinite time."""
-    moments = ensemble.moments
+    is_ordered = scene is not None and scene.is_ordered
     blocks = moments.blocks("band_energy")
     total = merged(blocks)
-    ends = moments.blocks("long_time") if long_time else []
-    average_at_end = merged(ends) if ends else None
+    ends = moments.blocks("long_time_band_energy") if "long_time_band_energy" in moments.names else []
+    end: Moments | None = merged(ends) if ends else None
     return BandTransfer(
         scene,
-        scene.times,
+        times,
         total.mean,
-        ordered_error(scene, total),
-        average_at_end.mean if average_at_end else None,
-        ordered_error(scene, average_at_end) if average_at_end else None,
+        ordered_error(is_ordered, total),
+        end.mean if end else None,
+        ordered_error(is_ordered, end) if end else None,
         torch.stack([block.mean for block in blocks]),
         torch.stack([block.mean for block in ends]) if ends else None,
         tuple(block.count for block in blocks),
-        ensemble.attributes,
+        attributes,
+        provenance,
     )
 
 

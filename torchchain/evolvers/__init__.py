@@ -9,22 +9,14 @@ from torchchain.chain import amplitude
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.evolvers import chebyshev, damped, modes, ode, symplectic4, tridiagonal, verlet
-from torchchain.evolvers.method import Advance, Method
+from torchchain.evolvers.method import METHODS, Advance, Method, register_method
 
-METHODS: dict[str, Method] = {
-    entry.name: entry
-    for entry in (
-        modes.METHOD,
-        tridiagonal.METHOD,
-        chebyshev.METHOD,
-        verlet.METHOD,
-        symplectic4.METHOD,
-        damped.METHOD,
-        *ode.METHODS,
-    )
-}
+for _method in (
+    modes.METHOD, tridiagonal.METHOD, chebyshev.METHOD, verlet.METHOD, symplectic4.METHOD, damped.METHOD, *ode.METHODS
+):  # fmt: skip
+    register_method(_method)
 
-__all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "start"]
+__all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "register_method", "start"]
 
 
 def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:

@@ -6,7 +6,7 @@ With A = -M^-1 K, a squared frequency W^2 that no mode exceeds, x = 1 - 2 A / W^
 
 (Tal-Ezer, SIAM J. Numer. Anal. 23, 11, 1986; Kosloff et al., Geophys. Prospecting 37, 383, 1989): a polynomial in A
 of a degree that is z / 2 and a few more. A start (u, v) needs it, its time integral and its time derivative, which
-are sums over the same T_k; :func:`coefficients` has theirs. No matrix is formed.
+are sums over the same T_k; :mod:`coefficients` has theirs. No matrix is formed.
 
 The times are crossed in *segments*; see :data:`LEAP`. The sums leave out coefficients that add up to no more than
 accuracy / 1024, or half an ulp where that is larger, in each segment. As |T_k(x)| <= 1 on the spectrum, what is left
@@ -31,7 +31,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
-from torchchain.evolvers.expansion import LEAP, ROUNDING, SEGMENTS, coefficients
+from torchchain.evolvers.expansion import LEAP, ROUNDING, SEGMENTS
 from torchchain.evolvers.method import Advance, Method
 from torchchain.modes import phase
 
@@ -173,6 +173,8 @@ def check_work(times: Tensor, frequency: float) -> None:
 
 def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> Advance:
     """The expansion in plain torch, from each output time to the next."""
+    from torchchain.evolvers.coefficients import coefficients_of  # imports Numba
+
     axis = len(chain.batch_shape)
     pair = torch.stack([state.displacement, state.velocity], dim=axis)
     ahead = (None,) * (pair.ndim - axis - 1)  # axes of a state behind the batch
@@ -181,7 +183,7 @@ def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> A
     now = 0.0
 
     def step(pair: Tensor, time: np.ndarray) -> Tensor:
-        table = torch.from_numpy(coefficients(frequencies, time, tolerance)).to(pair)
+        table = torch.from_numpy(coefficients_of(frequencies, time, tolerance)).to(pair)
         table = table.reshape(*table.shape[:2], *chain.batch_shape)[(..., *ahead)]
         older, old = pair, pair + weight / 2 * chain.force(pair)
         total: list[Tensor] = []
@@ -233,12 +235,9 @@ class CompiledAdvance:
         def plain(x: Tensor) -> np.ndarray:
             return x.detach().double().reshape(-1, x.shape[-1]).contiguous().numpy()
 
-        contacts = chain.contact_stiffness
-        if chain.boundary == "periodic":
-            contacts = torch.cat([contacts, contacts[..., :1]], dim=-1)
-        masses, springs = plain(chain.masses), plain(contacts)
+        masses, springs = plain(chain.masses), plain(chain.in_a_row(chain.contact_stiffness))
         states = torch.stack([state.displacement.detach(), state.velocity.detach()], dim=-2)
-        periodic = chain.boundary == "periodic"
+        periodic = chain.is_free
         squared = np.empty(len(masses))
         if bound is None:
             stencil.share(
@@ -250,6 +249,7 @@ class CompiledAdvance:
         self.rows: Rows = stencil.Rows(
             masses=masses,
             contacts=springs,
+            rigid_masses=plain(chain.rigid_mass[..., None])[:, 0],
             frequencies=_rounded_up(np.sqrt(squared)),
             states=states.double().reshape(-1, 2, n).numpy(),
             starts=math.prod(state.displacement.shape[:-1]) // len(masses),
@@ -291,6 +291,8 @@ METHOD = Method(
     stability="unconditional: the spectrum lies below a rigorous bound, and a bound that is too small is refused",
     cost="about W t / 2 stencils and 4 W sums of N numbers per unit of time (W: highest frequency); memory of a state",
     cannot="damping, Hertz contacts",
+    candidate=True,
+    compiled=True,
     options={
         "accuracy": "what truncation may leave out, relative to the size of the state, over 1024 segments (1e-12)",
         "bound": "squared frequency that no mode exceeds, a number or (*batch,); by default a rigorous one",

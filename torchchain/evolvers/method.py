@@ -1,4 +1,4 @@
-"""What every way to evolve a chain has in common: the record it returns and the facts it states."""
+"""What every way to evolve a chain has in common: one record of its facts, and the registry of all of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
+from torchchain import checks
 from torchchain.chain.states import Trajectory
 
 Advance = Callable[[Tensor], Trajectory]
@@ -15,21 +16,72 @@ Advance = Callable[[Tensor], Trajectory]
 
 @dataclass(frozen=True)
 class Method:
-    """One way to evolve a chain: the registry's entry, which tests, charts, the plan and the manual iterate over.
+    """One way to evolve a chain: what tests, charts, the plan, the memory estimate and the manual read.
 
     ``start(chain, state, **options)`` checks its arguments and does what is done once; the function it returns
     is called with increasing windows of times.
+
+    Attributes:
+        name: for ``evolve(method=)``, an identifier.
+        start: see above.
+        summary, order, conserves, stability, cost, cannot: in words; an exact method's order starts with "exact".
+        boundaries, contacts, damped: the chains it can treat.
+        options: name and meaning of each option of ``start``.
+        candidate: whether the plan weighs it.
+        single_precision: whether it keeps what it computes in float32, where the states are.
+        compiled: whether it runs Numba kernels for tensors on the CPU that need no gradient.
+        matrices: how many arrays of n_particles^2 numbers it holds per realization.
+        order_in_step: for a method with a ``step``, the order of its error in it; else None.
+        phase_error: c of the error c w^(order + 1) step^order t of a mode of frequency w; nan where it is not known.
+        forces_per_step: evaluations of the contact forces in a step.
+        stability_limit: largest stable w_max step; None where no step is limited, or none is stable.
     """
 
     name: str
     start: Callable[..., Advance]
     summary: str
-    order: str
-    conserves: str
-    stability: str
-    cost: str
-    cannot: str
+    order: str = ""
+    conserves: str = ""
+    stability: str = ""
+    cost: str = ""
+    cannot: str = ""
     boundaries: tuple[str, ...] = ("periodic", "fixed")
     contacts: tuple[str, ...] = ("linear",)
     damped: bool = False
     options: dict[str, str] = field(default_factory=dict)
+    candidate: bool = False
+    single_precision: bool = False
+    compiled: bool = False
+    matrices: int = 0
+    order_in_step: int | None = None
+    phase_error: float = float("nan")
+    forces_per_step: int = 1
+    stability_limit: float | None = None
+
+
+METHODS: dict[str, Method] = {}
+"""All methods by name."""
+
+
+def register_method(method: Method) -> Method:
+    """Add a method of one's own to those that ``evolve``, scenes and the command line know by name.
+
+    Args:
+        method: its record. With ``candidate=True`` the plan weighs it, which takes ``order_in_step``, ``phase_error`` and
+            ``stability_limit`` for one with a ``step``.
+
+    Returns:
+        The method.
+
+    Raises:
+        FieldError, FieldTypeError: for a name that is taken or no identifier, or for what is no Method.
+    """
+    checks.instance("method", method, Method)
+    if not (isinstance(method.name, str) and method.name.isidentifier()):
+        raise checks.fail("method.name", "be an identifier", repr(method.name))
+    if method.name in METHODS or method.name == "auto":
+        raise checks.fail("method.name", "be free", repr(method.name))
+    if not callable(method.start):
+        raise checks.FieldTypeError(f"method.start must be callable, got {checks.shown(method.start)}")
+    METHODS[method.name] = method
+    return method

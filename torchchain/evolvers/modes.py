@@ -32,5 +32,7 @@ METHOD = Method(
     stability="unconditional",
     cost="N^3 once, N^2 per output time; N^2 memory",
     cannot="damping, Hertz contacts, chains of more than some thousand particles",
+    candidate=True,
+    matrices=8,
     options={"modes": "NormalModes of the chain, where they are at hand"},
 )

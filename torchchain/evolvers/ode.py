@@ -37,12 +37,9 @@ from torchchain.evolvers.symplectic import (
     largest_overlap,
     substeps,
 )
+from torchchain.odes import INTEGRATORS, IntegrationError, Integrator, member_norm, step_grid
 
 ALLOWED_DRIFT = 0.1
-
-
-class IntegrationError(RuntimeError):
-    """An adaptive solver gave up."""
 
 
 class _Motion:
@@ -85,23 +82,18 @@ class _Motion:
 
 @dataclass(frozen=True)
 class _Solver:
-    """What one of torchdiffeq's solvers needs to be told, and what is known of it; rtol is a power of eps."""
+    """What an integrator is called and told here; rtol is a power of eps, the limits are those of w_max and d_max step."""
 
     name: str
-    order: int
-    evaluations: str
+    integrator: Integrator
     summary: str
-    stability: str
-    torchdiffeq: str
+    stability: str = "by its error estimate"
     rtol: float = 0.5
     options: dict[str, Any] = field(default_factory=dict)
+    order: int | None = None
+    evaluations: str = ""
     limit: float | None = None
     damping_limit: float | None = None
-
-
-def _member_norm(y: Tensor) -> Tensor:
-    """The largest root-mean-square over the members of a batch, where torchdiffeq would average over all of them."""
-    return y.square().mean(-1).sqrt().amax()
 
 
 def _evolve(
@@ -159,7 +151,7 @@ def _start_adaptive(
     eps = torch.finfo(chain.masses.dtype).eps
     rtol = min(eps**solver.rtol, 1e-3) if rtol is None else checks.number("rtol", rtol, at_least=4 * eps, below=1)
     atol = None if atol is None else checks.number("atol", atol, above=0)
-    if solver.torchdiffeq == "scipy_solver" and torch.is_grad_enabled():
+    if solver.name == "lsoda" and torch.is_grad_enabled():
         for name in ("masses", "stiffness", "damping"):
             _refuse_gradient(name, torch.as_tensor(getattr(chain, name)), solver.name)
         for name in ("displacement", "velocity"):
@@ -167,13 +159,13 @@ def _start_adaptive(
 
     def integrate(motion: _Motion, y: Tensor, now: float, times: list[float]) -> list[Tensor]:
         grid = torch.tensor([0.0, *(time - now for time in times)], dtype=torch.float64, device=y.device)
-        motion.since, motion.note_calls = now, solver.torchdiffeq == "scipy_solver"
+        motion.since, motion.note_calls = now, solver.name == "lsoda"
         options = dict(solver.options)
         absolute = (rtol * motion.amplitude)[..., None].expand(y.shape) if atol is None else torch.tensor(atol).to(y)
         if not motion.note_calls:
             motion.callback_accept_step = motion.note_step  # type: ignore[attr-defined]
             # Outputs that are steps: what it interpolates from is less accurate than its steps.
-            options |= {"norm": _member_norm, "step_t": grid[1:]}
+            options |= {"norm": member_norm, "step_t": grid[1:]}
         try:
             series = odeint(
                 motion,
@@ -181,7 +173,7 @@ def _start_adaptive(
                 grid,
                 rtol=rtol,
                 atol=absolute.cpu().flatten().numpy() if motion.note_calls else absolute,
-                method=solver.torchdiffeq,
+                method=solver.integrator.name,
                 options=options,
             )
         except AssertionError as error:
@@ -226,21 +218,16 @@ def _start_fixed(solver: _Solver, chain: Chain, state: State, step: float | None
                 last += 1
             motion.since = starts[first]
             outputs = [0.0, *(time - starts[first] for time in times[first:last])]
-            pieces = [
-                torch.linspace(begin, end, count + 1, dtype=torch.float64)[:-1]
-                for begin, end, count in zip(outputs[:-1], outputs[1:], counts[first:last], strict=True)
-            ]
-            t = torch.tensor(outputs, dtype=torch.float64)
-            grid = torch.cat([*pieces, t[-1:]])
+            grid = step_grid(outputs, counts[first:last]).to(y.device)
+            t = torch.tensor(outputs, dtype=torch.float64, device=y.device)
             found = odeint(
                 motion,
                 y,
-                t.to(y.device),
-                # An explicit predictor corrected once, not iterated: any tolerance will do.
-                rtol=1e3,
+                t,
+                rtol=1e3,  # a corrector that does not iterate meets any
                 atol=1e3,
-                method=solver.torchdiffeq,
-                options={**solver.options, "grid_constructor": partial(_fixed_grid, grid.to(y.device))},
+                method=solver.integrator.name,
+                options={**solver.options, "grid_constructor": lambda *_, grid=grid: grid},
             )
             series += found[1:]
             y, first = series[-1], last
@@ -249,57 +236,51 @@ def _start_fixed(solver: _Solver, chain: Chain, state: State, step: float | None
     return _evolve(chain, state, integrate, f"method '{solver.name}' with step {step:.4g}: use a smaller step")
 
 
-def _fixed_grid(grid: Tensor, *_: Any) -> Tensor:
-    return grid
-
-
 NO_STEP = (
     "no step is stable on an undamped chain: the amplitude of a mode grows by a factor of 1 + {growth} at every step"
 )
 
-ADAPTIVE = (
-    _Solver("dopri5", 5, "6", "Dormand and Prince 5(4)", "by its error estimate", "dopri5"),
-    _Solver("dopri8", 8, "13", "Dormand and Prince 8(7)", "by its error estimate", "dopri8"),
-    _Solver("bosh3", 3, "3", "Bogacki and Shampine 3(2)", "by its error estimate", "bosh3", rtol=0.4),
-    _Solver("adaptive_heun", 2, "2", "Heun 2(1)", "by its error estimate", "adaptive_heun", rtol=0.3),
-    _Solver("fehlberg2", 2, "3", "Fehlberg 2(1)", "by its error estimate", "fehlberg2", rtol=0.4),
-    _Solver("lsoda", 0, "about 2", "LSODA, Adams of variable order", "by its error estimate", "scipy_solver"),
-)
 
-FIXED = (
-    _Solver("midpoint", 2, "2", "explicit midpoint rule", NO_STEP.format(growth="(w step)^4 / 8"), "midpoint"),
-    _Solver("heun2", 2, "2", "Heun's second-order rule", NO_STEP.format(growth="(w step)^4 / 8"), "heun2"),
-    _Solver(
-        "heun3", 3, "3", "Heun's third-order rule", "w_max step < 1.732", "heun3", limit=3**0.5, damping_limit=2.51
-    ),
-    _Solver("rk4", 4, "4", "Runge-Kutta, 3/8 rule", "w_max step < 2.828", "rk4", limit=8**0.5, damping_limit=2.78),
-    _Solver(
-        "explicit_adams",
-        4,
-        "1",
-        "Adams and Bashforth with four past steps",
-        "w_max step < 0.43",
-        "explicit_adams",
-        options={"max_order": 5},
-        limit=0.43,
-        damping_limit=0.3,
-    ),
-    _Solver(
-        "implicit_adams",
-        5,
-        "2",
-        "Adams, Bashforth and Moulton with four past steps, corrected once",
-        NO_STEP.format(growth="0.1 (w step)^6") + ", and w_max step must be less than 1",
-        "implicit_adams",
-        options={"max_order": 5},
-        limit=1.0,
-        damping_limit=1.41,
-    ),
+def _solver(method: str, name: str = "", **told: Any) -> _Solver:
+    """An integrator as it is used here: its own facts, but for those that are told."""
+    known = INTEGRATORS[method]
+    facts: dict[str, Any] = {
+        "summary": known.summary,
+        "order": known.order,
+        "evaluations": str(known.evaluations),
+        "limit": known.swing_limit or None,
+        "damping_limit": known.decay_limit if known.swing_limit else None,
+    }
+    return _Solver(name or method, known, **{**facts, **told})
+
+
+ADAPTIVE = (
+    _solver("dopri5"),
+    _solver("dopri8"),
+    _solver("bosh3", rtol=0.4),
+    _solver("adaptive_heun", rtol=0.3),
+    _solver("fehlberg2", rtol=0.4),
+    _solver("scipy_solver", "lsoda", summary="LSODA, Adams of variable order", evaluations="about 2"),
 )
+ADAMS = {"max_order": 5}  # the number of slopes that torchdiffeq keeps, one more than it uses
+FIXED = (
+    _solver("midpoint", stability=NO_STEP.format(growth="(w step)^4 / 8")),
+    _solver("heun2", stability=NO_STEP.format(growth="(w step)^4 / 8")),
+    _solver("heun3", stability="w_max step < 1.732"),
+    _solver("rk4", stability="w_max step < 2.828"),
+    _solver("explicit_adams", stability="w_max step < 0.43", options=ADAMS),
+    # An explicit predictor corrected once, not iterated.
+    _solver(
+        "implicit_adams",
+        summary="Adams, Bashforth and Moulton with four past steps, corrected once",
+        stability=NO_STEP.format(growth="0.1 (w step)^6") + ", and w_max step must be less than 1",
+        options=ADAMS, order=5, evaluations="2", limit=1.0, damping_limit=1.41,
+    ),
+)  # fmt: skip
 
 
 def _entry(solver: _Solver, start: Callable[..., Advance], options: dict[str, str]) -> Method:
-    adaptive, gradient = solver in ADAPTIVE, solver.torchdiffeq != "scipy_solver"
+    adaptive, gradient = solver.integrator.adaptive, solver.name != "lsoda"
     loss = "keep energy: it drifts, and a drift beyond a tenth is an error"
     return Method(
         name=solver.name,
@@ -313,6 +294,10 @@ def _entry(solver: _Solver, start: Callable[..., Advance], options: dict[str, st
         contacts=("linear", "hertz"),
         damped=True,
         options=options,
+        candidate=solver.name == "dopri8",
+        order_in_step=None if adaptive else solver.order,
+        forces_per_step=int(solver.evaluations[-1:] if solver.name == "lsoda" else solver.evaluations),
+        stability_limit=solver.limit,
     )
 
 

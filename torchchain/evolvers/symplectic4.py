@@ -37,5 +37,12 @@ METHOD = Method(
     cost="four forces per step, N each; no memory beyond the states",
     cannot="damping (its negative substeps would amplify); order 4 once Hertz contacts open (it is about 2.5 then)",
     contacts=("linear", "hertz"),
+    candidate=True,
+    single_precision=True,
+    compiled=True,
+    order_in_step=4,
+    phase_error=6e-5,
+    forces_per_step=4,
+    stability_limit=PEFRL.limit,
     options={"step": "largest step; outputs are reached by equal steps of at most that (default 0.4 / w_max)"},
 )

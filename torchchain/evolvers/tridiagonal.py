@@ -48,4 +48,6 @@ METHOD = Method(
     cost="as 'modes', with a decomposition several times faster from some hundred particles on",
     cannot="periodic chains, damping, Hertz contacts, gradients of masses and stiffness (those of the state it can)",
     boundaries=("fixed",),
+    candidate=True,
+    matrices=8,
 )

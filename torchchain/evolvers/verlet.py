@@ -27,6 +27,13 @@ METHOD = Method(
     cost="one force per step, N each; no memory beyond the states",
     cannot="keep phases: their error grows with time; order 2 once damped Hertz contacts open (it is 1 then)",
     contacts=("linear", "hertz"),
+    candidate=True,
+    single_precision=True,
+    compiled=True,
+    order_in_step=2,
+    phase_error=1 / 24,
+    forces_per_step=1,
+    stability_limit=VERLET.limit,
     damped=True,
     options={"step": "largest step; outputs are reached by equal steps of at most that (default 0.1 / w_max)"},
 )

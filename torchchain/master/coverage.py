@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from functools import partial
 from pathlib import Path
 
@@ -14,13 +13,11 @@ from torchchain import checks
 from torchchain.chain.excitation import StandingWave
 from torchchain.energy.bands import band_of
 from torchchain.ensemble import plan as planning
-from torchchain.ensemble.machine import Machine
 from torchchain.ensemble.plan import ARTIFACT, Choice, Plan, statistical_error
 from torchchain.ensemble.scene import Scene
 from torchchain.master.equation import MasterEquation
 
 PREDICTED = frozenset({"band_energy", "long_time_band_energy"})
-TIMED = 64  # times of the trial solution
 
 
 def gaps(master: MasterEquation, scene: Scene) -> list[str]:
@@ -55,27 +52,21 @@ def error(master: MasterEquation, scene: Scene) -> float | None:
     return math.sqrt(max(0.0, held**2 - halves**2) + halves**2 / 4)
 
 
-def seconds(master: MasterEquation, scene: Scene) -> float:
-    """Time of a prediction, from a trial solution of up to 64 of its times after one that does not count."""
-    rows, some = starts(master, scene), scene.times[-TIMED:]
-    spent = 0.0
-    for _ in range(2):
-        begin = time.perf_counter()
-        master.solve(rows, some)
-        spent = time.perf_counter() - begin
-    return spent * len(scene.times) / len(some)
+def cost(master: MasterEquation, scene: Scene) -> float:
+    """Seconds of a prediction on the plan's nominal core: the propagators of all times, applied to all starts."""
+    n, times = master.n_bands, len(scene.times)
+    return 2e-3 + times * (1e-5 + 2e-10 * n**3 + 1e-9 * n**2 * len(scene.tones))
 
 
-def plan(scene: Scene, machine: Machine | None = None, artifact: str | Path | MasterEquation | None = None) -> Plan:
+def plan(scene: Scene, artifact: str | Path | MasterEquation | None = None) -> Plan:
     """The cheapest way to a scene whose predicted error is within its tolerance.
 
     Without a tolerance the method's error may be a third of the statistical error of the ensemble, to which it adds
-    5 %: a finer integrator would be waste. Errors come from each method's own theory, times from counted work and the
-    speeds of the machine.
+    5 %: a finer integrator would be waste. Errors come from each method's own theory, costs from counted work on a
+    nominal core, so that a scene has one plan on every machine and at every time.
 
     Args:
         scene: what is wanted.
-        machine: speeds; None for this machine's own.
         artifact: a calibrated master equation, or the file of one, that could take the place of the chains.
 
     Returns:
@@ -84,7 +75,7 @@ def plan(scene: Scene, machine: Machine | None = None, artifact: str | Path | Ma
     Raises:
         FieldError: if no method can treat the scene, or none reaches the tolerance.
     """
-    return planning.plan(scene, machine, None if artifact is None else partial(_stand_in, artifact=artifact))
+    return planning.plan(scene, None if artifact is None else partial(_stand_in, artifact=artifact))
 
 
 def _stand_in(scene: Scene, tolerance: float, artifact: str | Path | MasterEquation) -> tuple[list[Choice], list[str]]:
@@ -102,7 +93,8 @@ def _stand_in(scene: Scene, tolerance: float, artifact: str | Path | MasterEquat
     if expected is None:
         return [], ["the master equation at hand covers the scene, but its calibration does not tell its error"]
     allowed = tolerance if scene.tolerance is not None else statistical_error(scene)
-    choice = Choice(ARTIFACT, {}, expected, seconds(master, scene), allowed)
+    work = cost(master, scene)
+    choice = Choice(ARTIFACT, {}, expected, work, work * planning.speed(), allowed)
     verdict = "accurate enough" if choice.good else "not accurate enough"
     return [choice], [
         f"the master equation at hand covers the scene and is {verdict}: its shares of the energy are good to "

@@ -1,4 +1,4 @@
-"""The part of a chain that an impulse reaches by the last time; the rest stays at rest and need not be computed."""
+"""The part of a chain that an impulse sets in motion by the last time; the rest stays at rest and is not computed."""
 
 from __future__ import annotations
 
@@ -12,21 +12,32 @@ from torch import Tensor
 from torchchain.chain.chain import Chain
 from torchchain.chain.excitation import Impulse
 from torchchain.chain.states import State, Trajectory
+from torchchain.ensemble.observables import OBSERVABLES, chosen_observables, is_fused
 from torchchain.ensemble.scene import Scene
 
-LOCAL_OBSERVABLES = frozenset({"center", "displacement", "energy", "source_energy", "total_energy", "width"})
 WORTHWHILE = 0.7  # a part of the chain larger than this is not worth cutting out
 WORTHWHILE_FUSED = 0.25  # nor one larger than this for kernels that skip what is at rest: the check is a run of its own
 EDGE = 4  # particles beside a cut that must stay at rest
-AT_REST = 1e-28  # share of the energy, 1e-14 of the amplitude
+AT_REST = 1e-28  # of the energy, 1e-14 of the amplitude
 
 
-class ReachExceeded(Exception):
+class PartExceeded(Exception):
     """A wave has come to the end of the part that it was expected to stay in."""
 
 
+@dataclass(frozen=True, eq=False)
+class PartOfChain(Chain):
+    """The part of a chain that moves, between walls where it was cut; a ring's moves as a whole as the ring does."""
+
+    whole_rigid_mass: Tensor | None = None
+
+    @property
+    def rigid_mass(self) -> Tensor:
+        return super().rigid_mass if self.whole_rigid_mass is None else self.whole_rigid_mass
+
+
 @dataclass(frozen=True)
-class Reach:
+class MovingPart:
     """Particles first, ..., last - 1 of a chain of n_particles, counted from 0: all that move by the last time."""
 
     first: int
@@ -37,19 +48,16 @@ class Reach:
     def size(self) -> int:
         return self.last - self.first
 
-    def pays(self, fused: bool) -> bool:
-        """Whether cutting out the part saves time, for kernels that measure on their own, too."""
-        return not fused or self.size < WORTHWHILE_FUSED * self.n_particles
-
     def chain(self, chain: Chain) -> Chain:
         """The part as a chain of its own, between walls where it was cut: particles beyond stay at rest."""
         inner, contacts = slice(self.first, self.last), slice(self.first, self.last + 1)
-        return Chain(
+        return PartOfChain(
             chain.masses[..., inner],
             "fixed",
             chain.contact_stiffness[..., contacts],
             chain.contact,
             chain.contact_damping[..., contacts],
+            whole_rigid_mass=chain.rigid_mass,
         )
 
     def state(self, state: State) -> State:
@@ -69,48 +77,53 @@ class Reach:
         A wave that came to a cut earlier has left motion there: behind its front a chain rings.
 
         Raises:
-            ReachExceeded: the scene needs more of the chain.
+            PartExceeded: the scene needs more of the chain.
         """
         last = trajectory.final
-        kinetic = chain.align(chain.masses, last.velocity) * last.velocity.square()
-        share = kinetic + 4 * last.displacement.square()
-        edge = torch.zeros_like(share[..., 0])
+        motion = chain.align(chain.masses, last.velocity) * last.velocity.square() + 4 * last.displacement.square()
+        edge = torch.zeros_like(motion[..., 0])
         if self.first > 0:
-            edge = edge + share[..., :EDGE].sum(-1)
+            edge = edge + motion[..., :EDGE].sum(-1)
         if self.last < self.n_particles:
-            edge = edge + share[..., -EDGE:].sum(-1)
-        if not bool((edge <= AT_REST * share.sum(-1)).all()):
-            raise ReachExceeded
+            edge = edge + motion[..., -EDGE:].sum(-1)
+        if not bool((edge <= AT_REST * motion.sum(-1)).all()):
+            raise PartExceeded
 
     def embed(self, name: str, values: Tensor) -> Tensor:
         """An observable of the part as one of the whole chain."""
-        if name == "center":
-            return values + self.first
-        if name in ("energy", "displacement"):
-            return torch.nn.functional.pad(values, (self.first, self.n_particles - self.last))
-        return values
+        entry = OBSERVABLES[name]
+        if "particle" in entry.axes:
+            after = 2 * (len(entry.axes) - 1 - entry.axes.index("particle"))
+            return torch.nn.functional.pad(values, (*[0] * after, self.first, self.n_particles - self.last))
+        return values + self.first if entry.is_place else values
 
 
-def reach(scene: Scene) -> Reach | None:
-    """The part of the scene's chains that an impulse reaches by the last time, or None where nothing can be left out.
+def moving_part(scene: Scene, method: str | None = None) -> MovingPart | None:
+    """The part of the scene's chains that moves by the last time, or None where nothing is worth leaving out.
 
     On average masses a wave travels one particle per unit time; ahead of its front the motion falls like an Airy
     function of width (t / 2)^(1/3), and to 1e-16 within 15 of them. Stretches of light particles are faster, and so
-    is a Hertz contact under compression. None of this is rigorous in a random chain, so :meth:`Reach.check` looks.
+    is a Hertz contact under compression. None of this is rigorous in a random chain, so :meth:`MovingPart.check` looks.
+
+    Args:
+        scene: what is wanted.
+        method: that evolves the chains; None for any that stores states.
     """
-    if not isinstance(scene.excitation, Impulse) or not LOCAL_OBSERVABLES.issuperset(scene.observables):
+    if not isinstance(scene.excitation, Impulse) or not all(o.local for o in chosen_observables(scene.observables)):
         return None
     n, site, end = scene.n_particles, scene.excitation.site - 1, float(scene.times[-1])
-    distance = math.ceil(speed(scene) * end + 9 * (1 + end) ** (1 / 3) + 8)
+    distance = math.ceil(_front_speed(scene) * end + 9 * (1 + end) ** (1 / 3) + 8)
     first, last = site - distance, site + distance + 1
     if scene.boundary == "fixed":
         first, last = max(0, first), min(n, last)
     elif first < 0 or last >= n:  # a ring's contact 0 lies at its seam
         return None
-    return Reach(first, last, n) if last - first < WORTHWHILE * n else None
+    fused = method is not None and is_fused(method, scene.observables)
+    worthwhile = WORTHWHILE_FUSED if fused else WORTHWHILE
+    return MovingPart(first, last, n) if last - first < worthwhile * n else None
 
 
-def speed(scene: Scene) -> float:
+def _front_speed(scene: Scene) -> float:
     """A speed that fronts stay below: 1 on average masses and contacts, more for disorder and for large amplitudes."""
     xi = scene.disorder.strength + (scene.stiffness_disorder.strength if scene.stiffness_disorder else 0.0)
     amplitude = abs(scene.excitation.velocity) if isinstance(scene.excitation, Impulse) else 0.0
