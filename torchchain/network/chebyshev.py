@@ -26,8 +26,8 @@ from torchchain.chain import State
 from torchchain.evolvers.chebyshev import check_work
 from torchchain.evolvers.coefficients import coefficients_of
 from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS
-from torchchain.modes import phase
 from torchchain.evolvers.method import Advance, Method
+from torchchain.modes import phase
 from torchchain.network.lattices import PRIMITIVE, STEPS, Lattice
 from torchchain.network.modes import check_stability, exceeds
 from torchchain.network.networks import Network

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import State
-from torchchain.modes import phase
 from torchchain.evolvers.method import Advance, Method
+from torchchain.modes import phase
 from torchchain.network.modes import NetworkModes, normal_modes
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import NetworkTrajectory
