@@ -43,6 +43,7 @@ from torchchain.ensemble import register_observable as register_observable
 from torchchain.ensemble import simulate as simulate
 from torchchain.ensemble.checkpoint import Checkpoint as Checkpoint
 from torchchain.ensemble.checkpoint import CheckpointWarning as CheckpointWarning
+from torchchain.ensemble.estimate import estimate_disorder as estimate_disorder
 from torchchain.ensemble.fused import energy_moments as energy_moments
 from torchchain.ensemble.observables import OBSERVABLES as OBSERVABLES
 from torchchain.ensemble.plan import Plan as Plan
@@ -133,6 +134,7 @@ __all__ = [
     "calibrate_family",
     "energy_center",
     "energy_width",
+    "estimate_disorder",
     "evolve",
     "impulse",
     "lattice",

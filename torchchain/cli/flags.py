@@ -145,6 +145,8 @@ class Calibrate(RunFlags):
     """ensembles drawn again for the error bars, 0 for none"""
     out: Annotated[str, flag("FOLDER", "results/calibrate")] = "results/calibrate"
     """for config.toml, transfer.nc, model.safetensors, figure.png and run.json"""
+    method: Annotated[str, flag(("auto", "theory", *choices.METHODS), "auto")] = "auto"
+    """how to evolve the chains; auto for the plan's choice, theory for band energies without chains"""
 
     def calibration(self) -> dict[str, Any]:
         """The flags of the fit that were given."""

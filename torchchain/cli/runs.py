@@ -15,12 +15,13 @@ import torch
 
 from torchchain import checks
 from torchchain.cli import outputs, plugins
-from torchchain.cli.flags import RunFlags, SceneFlags
+from torchchain.cli.flags import Calibrate, RunFlags, SceneFlags
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble import ranks
 from torchchain.ensemble.checkpoint import Checkpoint, Interrupted
 from torchchain.ensemble.scene import Scene, read_toml
 from torchchain.ensemble.stages import Stages
+from torchchain.ensemble.transfer import THEORY
 from torchchain.evolvers import METHODS
 
 Measured = TypeVar("Measured")
@@ -113,7 +114,7 @@ def running(
     """A run whose flags are checked and whose folder is its own; an interrupt tells of what is kept."""
     began = time.time()
     device = str(checks.device("device", ranks.own_device(flags.device)))
-    checks.choice("method", flags.method, ("auto", *METHODS))
+    checks.choice("method", flags.method, ("auto", *METHODS, *([THEORY] if isinstance(flags, Calibrate) else [])))
     with outputs.run_folder(flags.out) as out:
         checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
         try:

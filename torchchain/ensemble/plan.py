@@ -214,7 +214,7 @@ def forecast(scene: Scene, how: Mapping[str, Any], spent: float, statistical: fl
         predicted_seconds, seconds, predicted_error, statistical_error; no prediction for methods that no plan weighs.
     """
     measured = {"seconds": spent, "statistical_error": statistical}
-    if not METHODS[how["method"]].candidate:
+    if how["method"] not in METHODS or not METHODS[how["method"]].candidate:
         return measured
     options = json.loads(how["method_options"])
     dtype = torch.float32 if options.pop("dtype", "") == "float32" else torch.float64

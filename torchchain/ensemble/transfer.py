@@ -29,7 +29,12 @@ from torchchain.ensemble.run import ensemble_moments
 from torchchain.ensemble.scene import Scene, describe
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.statistics import EnsembleMoments, Moments, merged
+from torchchain.theory.law import law_of
+from torchchain.theory.transfer import theory_transfer
 from torchchain.threads import single_thread
+
+THEORY = "theory"
+"""The method of a transfer without chains."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,8 @@ class BandTransfer(Printed):
         attributes: of a simulation the realized mean and standard deviation of the masses, ``mass_mean`` and
             ``mass_sd``, the ``method`` that evolved the chains and, as JSON, its ``method_options``.
         provenance: where it comes from; of a simulation, left out, its scene.
+        systematic: of a transfer from theory, estimated total variation distance from an endless ensemble, [source, time];
+            else None.
     """
 
     scene: Scene | None
@@ -80,6 +87,7 @@ class BandTransfer(Printed):
     block_counts: tuple[int, ...]
     attributes: dict[str, Any] = field(default_factory=dict)
     provenance: Provenance | None = None
+    systematic: Tensor | None = None
 
     def __post_init__(self) -> None:
         checks.instance("scene", self.scene, Scene, type(None))
@@ -102,11 +110,11 @@ class BandTransfer(Printed):
         whole, late, blocks = (n, len(self.times), n), (n, n), len(counts)
         shapes = {
             "mean": whole, "stderr": whole, "long_time": late, "long_time_stderr": late,
-            "block_mean": (blocks, *whole), "block_long_time": (blocks, *late),
+            "block_mean": (blocks, *whole), "block_long_time": (blocks, *late), "systematic": whole[:2],
         }  # fmt: skip
         for name, shape in shapes.items():
             value = getattr(self, name)
-            if value is None and "long_time" in name and self.long_time is None:
+            if value is None and (name == "systematic" or ("long_time" in name and self.long_time is None)):
                 continue
             checks.instance(name, value, Tensor)
             if value.layout != torch.strided or value.is_meta or not value.is_floating_point():
@@ -164,6 +172,8 @@ class BandTransfer(Printed):
             put("long_time", (s, r), self.long_time, "infinite-time average of the share")
             put("long_time_stderr", (s, r), self.long_time_stderr, "its standard error")
             put("block_long_time", (b, s, r), self.block_long_time, "block means")
+        if self.systematic is not None:
+            put("systematic", (s, t), self.systematic, "estimated total variation distance from an endless ensemble")
         bands = np.arange(1, self.n_bands + 1)
         coords = {
             **time_coordinates(self.times, self.scene.si if self.scene is not None else None),
@@ -219,6 +229,7 @@ class BandTransfer(Printed):
             tuple(checks.integer("data.block_count", n, 1) for n in np.atleast_1d(data["block_count"].values)),
             attributes,
             _provenance_of(data),
+            tensor("systematic") if "systematic" in data else None,
         )
 
     def save(self, path: str | Path) -> None:
@@ -364,7 +375,8 @@ def band_transfer(
 
     Args:
         scene: standing waves with one tone in each of its bands, or none given (the bands' center tones).
-        method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
+        method: a name of ``evolvers.METHODS``; "auto" for the plan's choice; or "theory" for band energies without chains
+            (see :func:`torchchain.theory.theory_transfer`): no statistical error, ``systematic`` as its own estimate.
         long_time: also take the exact infinite-time average from the modes; damped chains have none.
         device, memory_budget, progress, stages, options: see :func:`stream`.
         checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
@@ -378,6 +390,10 @@ def band_transfer(
     """
     checks.truth("long_time", long_time)
     scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
+    if method == THEORY:
+        checks.known_keys("options of method 'theory'", options or {}, ())
+        with stages("theory"):
+            return _from_theory(scene, long_time and scene.damping == 0)
     late = ("long_time_band_energy",) if long_time and scene.damping == 0 else ()
     ensemble = ensemble_moments(
         replace(scene, observables=("band_energy", *late)), method,
@@ -386,6 +402,25 @@ def band_transfer(
     )  # fmt: skip
     with single_thread(), stages("statistics"):
         return _from_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None)
+
+
+def _from_theory(scene: Scene, long_time: bool) -> BandTransfer:
+    """The transfer of the scene's law of disorder, without chains; its realizations do not matter."""
+    if scene.energy_definition != "site":
+        raise checks.fail("energy_definition", "be 'site' for method 'theory'", repr(scene.energy_definition))
+    found = theory_transfer(
+        scene.disorder, scene.n_particles, scene.n_bands, scene.times, scene.tones, scene.boundary,
+        scene.stiffness_disorder, scene.contact, scene.damping,
+    )  # fmt: skip
+    law, late = law_of(scene.disorder), found.long_time if long_time else None
+    attributes = {
+        "method": THEORY, "method_options": "{}", "mass_mean": law.mean, "mass_sd": max(0.0, law.variance) ** 0.5,
+    }  # fmt: skip
+    return BandTransfer(
+        scene, scene.times, found.mean, torch.zeros_like(found.mean), late,
+        None if late is None else torch.zeros_like(late), found.mean[None], None if late is None else late[None], (1,),
+        attributes, Provenance("theory", describe(scene)), found.systematic,
+    )  # fmt: skip
 
 
 def _from_moments(
