@@ -524,7 +524,7 @@ def test_families_refuse(family):
 
 
 def test_families_from_the_command_line(family, tmp_path, capsys):
-    from torchchain.cli.entry import main
+    from torchchain.cli import main
 
     files = []
     for member in family.members:
