@@ -48,8 +48,8 @@ class MemoryModel(TransferModel):
         "pair_decay": ("function",), "pair_frequency": ("function",),
     }  # fmt: skip
     rates_meaning: ClassVar[str] = (
-        "mean slope of the energies in the calibration's window, per energy of the source; the prediction does not use it, "
-        "and it is not the paper's Q (torchchain.paper_rates)"
+        "mean slopes of the energies in the calibration's window, which the prediction does not use; "
+        "not the paper's Q, which is torchchain.paper_rates(transfer)"
     )
 
     def __init__(
@@ -113,7 +113,7 @@ class MemoryModel(TransferModel):
 
     @property
     def words(self) -> str:
-        return f"{len(self.decay)} exponentials, {len(self.pair_decay)} pairs, {self.n_parameters} fitted numbers"
+        return f"order ({len(self.decay)}, {len(self.pair_decay)}), {self.n_parameters} fitted numbers"
 
     def functions(self, times: Tensor) -> Tensor:
         """f_m at each time, (time, function)."""

@@ -55,7 +55,7 @@ class Poles:
         return np.concatenate([np.exp(-self.decay * t), pairs.reshape(len(times), -1)], axis=1)
 
     def slopes(self, times: np.ndarray) -> np.ndarray:
-        """t f_m at each time, (time, function), of which the derivatives to all rates and frequencies are sums."""
+        """t f_m at each time, (time, function), of which the derivatives to all rates and frequencies are made."""
         return times[:, None] * self.functions(times)
 
 
