@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 
 import torchchain as tc
 from torchchain.master.adam import CONSTRAINTS
-from torchchain.master.calibration import BASES, METHODS
 from torchchain.master.fits import FitWarning
+from torchchain.master.ladder import fitted_by, methods
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,13 @@ SMOKE = Config(n_bands=16, realizations=4, stop=5.0, adam_steps=5)
 def candidates(config: Config) -> list[tuple[str, str, str, dict[str, Any]]]:
     """Label, method, model and settings of everything that the library can fit."""
     found: list[tuple[str, str, str, dict[str, Any]]] = []
-    for method in METHODS:
-        if method == "projection":
-            found.append((method, method, "memory", {}))
-        elif method == "adam":
+    for method in methods():
+        models = [record.name for record in fitted_by(method)]
+        if method == "adam":
             found += [(f"adam, {c}", method, model, {"constraint": c, "steps": config.adam_steps})
-                      for model in BASES for c in CONSTRAINTS]  # fmt: skip
+                      for model in models for c in CONSTRAINTS]  # fmt: skip
         else:
-            found += [(method, method, model, {}) for model in BASES]
+            found += [(method, method, model, {}) for model in models]
     return found
 
 
@@ -93,7 +92,7 @@ def _judge(
         "drift": float(late.flatten()[late.abs().argmax()]),
         "lowest_rate": master.most_negative_rate if rated else np.nan,
         "lowest_energy": float(predicted.min()),
-        "parameters": 1 if method == "analytic" else master.model.n_parameters,
+        "parameters": master.n_parameters,
         "seconds": seconds,
         "cost": seconds / ensemble_seconds,
         "warning": str(caught[0].message) if caught else "",

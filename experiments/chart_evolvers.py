@@ -23,8 +23,8 @@ from scipy import special
 
 import torchchain as tc
 from torchchain import checks
-from torchchain.evolvers import chebyshev, expansion, ode
-from torchchain.evolvers.drift import EnergyDriftError
+from torchchain.evolvers import chebyshev, coefficients, expansion, ode
+from torchchain.evolvers.energy_guard import EnergyDriftError
 from torchchain.threads import single_blas_thread
 
 
@@ -193,7 +193,7 @@ def counted(
         tolerance = max(options["accuracy"] / expansion.SEGMENTS, expansion.ROUNDING)
         highest = float(chebyshev.highest_frequency(chain))
         leaps = math.ceil(highest * stop / expansion.LEAP)
-        table = expansion.coefficients(np.array([highest]), np.array([stop / leaps]), tolerance)
+        table = coefficients.coefficients_of(np.array([highest]), np.array([stop / leaps]), tolerance)
         return final, 2.0 * leaps * table.shape[1]  # of displacement and of velocity
     if method in ("verlet", "symplectic4"):
         return final, math.ceil(stop / options["step"]) * (1.0 if method == "verlet" else 4.0)

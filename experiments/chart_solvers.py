@@ -15,6 +15,7 @@ from unittest import mock
 import harness
 import numpy as np
 import torch
+import torchdiffeq
 import xarray
 from harness import Ensemble, Row
 from matplotlib.axes import Axes
@@ -22,8 +23,8 @@ from matplotlib.figure import Figure
 
 import torchchain as tc
 from torchchain import checks
-from torchchain.master import solvers
-from torchchain.master.equation import TrustWarning
+from torchchain.master import TrustWarning, solving
+from torchchain.odes import INTEGRATORS
 from torchchain.threads import single_blas_thread
 
 MILD, STIFF = "mild rates", "stiff rates"
@@ -65,7 +66,7 @@ def ways(reach: float) -> Iterator[tuple[str, str, tuple[dict[str, Any], ...]]]:
             for kind in SCIPY:
                 yield name, f"scipy {kind}", tuple({"rtol": r, "atol": r / 100, "solver": kind} for r in TOLERANCES)
         elif "step" in solver.options:
-            limit = solvers.STABILITY[name] * reach
+            limit = solving.STABILITY[name] * reach
             yield name, name, tuple({"step": share * limit} for share in SHARES)
         elif "rtol" in solver.options:
             yield name, name, tuple({"rtol": r, "atol": r / 100} for r in TOLERANCES)
@@ -132,7 +133,7 @@ def _curve(
     """A solver from coarse to fine, until a run takes too long."""
     start = torch.eye(master.n_bands, dtype=torch.float64)
     entries = []
-    original = solvers.torchdiffeq.odeint
+    original = torchdiffeq.odeint
     for options in every:
         calls = itertools.count()
 
@@ -149,7 +150,7 @@ def _curve(
             warnings.simplefilter("ignore", RuntimeWarning)  # SciPy's BDF at its first step
             try:
                 began = time.process_time()
-                with mock.patch.object(solvers.torchdiffeq, "odeint", counting):
+                with mock.patch.object(torchdiffeq, "odeint", counting):
                     found = master.solve(start, times, name, **options)
                 first = time.process_time() - began
             except (tc.master.IntegrationError, checks.FieldError):
@@ -181,8 +182,9 @@ def _look(label: str) -> dict[str, Any]:
         *(f"scipy {k}" for k in SCIPY),
     ]
     i = labels.index(label)
-    line = "-" if label in solvers.ADAPTIVE else "--" if label in solvers.FIXED else ":"
-    size = {"markersize": 11, "zorder": 5} if "step" not in label and label not in (*solvers.ADAPTIVE, *solvers.FIXED) and "scipy" not in label else {"markersize": 4}  # fmt: skip
+    adaptive = label in INTEGRATORS and INTEGRATORS[label].adaptive and "scipy" not in label
+    line = "-" if adaptive else "--" if label in solving.STABILITY else ":"
+    size = {"markersize": 11, "zorder": 5} if "step" not in label and label not in INTEGRATORS else {"markersize": 4}  # fmt: skip
     return {"color": f"C{i % 10}", "marker": "*osv^D<>pPXdh8"[i % 14], "linestyle": line, "linewidth": 1, **size}
 
 

@@ -26,8 +26,8 @@ from torchchain import checks
 from torchchain.evolvers import chebyshev, ode, symplectic
 from torchchain.evolvers.symplectic4 import PEFRL
 from torchchain.evolvers.verlet import VERLET
-from torchchain.master.equation import Calibration
-from torchchain.master.solvers import ADAMS_ITERATIONS, ADAMS_STEPS, STABILITY
+from torchchain.master import Calibration
+from torchchain.master.solving import ADAMS_ITERATIONS, ADAMS_STEPS, STABILITY
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 BLOWN_UP = 1e3
@@ -333,14 +333,14 @@ def _stiff_rates() -> list[Edge]:
 
 def _too_many_steps(method: str, value: float) -> Tensor:
     """As stiff a master equation, where the library is made to allow 50 steps."""
-    from torchchain.master import solvers
+    from torchchain.master import solving
 
-    allowed, solvers.MOST_STEPS = solvers.MOST_STEPS, 50
+    allowed, solving.MOST_STEPS = solving.MOST_STEPS, 50
     try:
         options = {"rtol": 1e-3, "atol": 1e-4}
         return master(exchange(1.0)).solve(torch.tensor([1.0, 0.0]), [value], method, **options)
     finally:
-        solvers.MOST_STEPS = allowed
+        solving.MOST_STEPS = allowed
 
 
 def _overflow() -> list[Edge]:

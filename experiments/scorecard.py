@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 import torchchain as tc
 from torchchain.master import TrustWarning
 from torchchain.master.fits import FitWarning
-from torchchain.master.ladder import BASES
-from torchchain.master.memory import LADDER
+from torchchain.master.ladder import fitted_by
+from torchchain.master.memory import ORDERS
 
 TARGET = 0.012
 """Largest mean total variation wanted from disorder 0.25 up; below, 1.25 times that of two ensembles."""
@@ -80,12 +80,12 @@ SMOKE = Config(
 def rungs(config: Config) -> list[tuple[str, str | None, str | None, dict[str, Any]]]:
     """Label, method, model and settings of all that is scored; the last is the library's own choice."""
     found: list[tuple[str, str | None, str | None, dict[str, Any]]] = [("paper, Eq. 50", "analytic", "paper", {})]
-    for model in BASES:
+    for model in (record.name for record in fitted_by("adam")):
         found.append((f"{model}, L", "linear", model, {}))
         found.append((f"{model}, Adam", "adam", model, {"steps": config.adam_steps}))
     found += [
         (f"memory {single}+{pairs}", "projection", "memory", {"order": (single, pairs), "bootstrap": 0})
-        for single, pairs in LADDER[::2]
+        for single, pairs in ORDERS[::2]
     ]
     return [*found, ("chosen", None, None, {})]
 
@@ -176,11 +176,10 @@ def _score(
         covered = float(((predicted - fresh.mean).square() < error)[:, later].double().mean())
         error = master.standard_error(start, times).square() + torch.einsum("ms,str->mtr", start**2, fresh.stderr**2)
         covered_mixed = float((mixed.square() < error)[:, later].double().mean())
-    parameters = 1 if master.calibration.method == "analytic" else master.model.n_parameters
     return {
         "label": label,
         "model": master.calibration.model,
-        "order": str(master.calibration.report.get("order", "")),
+        "order": str(list(getattr(master.calibration.report.fit, "order", ())) or ""),
         "strength": fresh.scene.disorder.strength,
         "n_particles": fresh.scene.n_particles,
         "n_bands": fresh.n_bands,
@@ -193,7 +192,7 @@ def _score(
         "noise_early": float(tc.statistical_distance(own.stderr)[:, later][:, early].mean()),
         "defect": float((predicted.sum(-1) - 1).abs().max()),
         "lowest": float(predicted.min()),
-        "parameters": parameters,
+        "parameters": master.n_parameters,
         "seconds": seconds,
         "ensemble_seconds": ensemble_seconds,
         "prediction_seconds": one,

@@ -17,7 +17,7 @@ from numba import njit
 
 import torchchain as tc
 from torchchain.ensemble import fused
-from torchchain.evolvers import chebyshev, expansion, stencil
+from torchchain.evolvers import chebyshev, coefficients, compiling, expansion
 from torchchain.threads import single_thread
 
 
@@ -62,7 +62,7 @@ SMOKE = Config(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def bare(older, old, weight, n, pairs):  # type: ignore[no-untyped-def]
     """T_k+1 = 2 x T_k - T_k-1 in place, 2 * pairs times, on n particles between two resting ones, and nothing else."""
-    stencil._wide_vectors()  # as the kernels
+    compiling.wide_vectors()  # as the kernels
     for _ in range(pairs):
         for p in range(1, n + 1):
             x = old[p]
@@ -88,7 +88,7 @@ def in_turn(
 
 def terms_at(frequency: float, time: float) -> int:
     """Terms of the expansion that the kernels take for one time, to rounding."""
-    return stencil._coefficients(frequency, time, expansion.ROUNDING, np.empty(1000), *np.empty((3, 1000)))
+    return coefficients.coefficients(frequency, time, expansion.ROUNDING, np.empty(1000), *np.empty((3, 1000)))
 
 
 def rates(config: Config, n: int) -> dict[str, list[float]]:

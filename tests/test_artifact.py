@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.master import Calibration
+from torchchain.master import AdamReport, Calibration, Report, Rung, Selection
 from torchchain.master.memory import MemoryModel
 
 B = 4
@@ -44,7 +44,8 @@ SCENE = tc.Scene(
 
 
 def master(model, window=(0.5, 2.0)):
-    report = {"converged": True, "loss": 1.25e-3, "entries": [[1, 2], [3, 4]], "note": "säkular\nzwei"}
+    fit = AdamReport(True, 7, 1.25e-3, 1.5, "exact", 10.0)
+    report = Report(fit, Selection("säkular\nzwei", tried=(Rung("memory", (1, 2), 0.25),)), horizon=12.5)
     return tc.MasterEquation(model, Calibration("adam", "basis_matrix", window, SCENE, report))
 
 
@@ -85,7 +86,7 @@ def test_a_file_on_the_way_replaces_only_when_whole(tmp_path, monkeypatch):
     def dies(*arguments, **settings):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchchain.master.artifact.save_file", dies)
+    monkeypatch.setattr("torchchain.master.file.save_file", dies)
     with pytest.raises(KeyboardInterrupt):
         master(memory()).save(path)
     assert path.read_bytes() == before
@@ -97,7 +98,7 @@ def test_the_header_tells_what_a_reader_needs(tmp_path):
     master(markov()).save(path)
     header = parts(path)[0]
     assert header["format"] == "torchchain-master-equation"
-    assert header["format_version"] == 2
+    assert header["format_version"] == 3
     assert (header["strength"], header["n_bands"], header["window"]) == (0.3, B, [0.5, 2.0])
     assert header["scene"]["seed"] == 2**64 - 1
     assert {"torchchain", "torch", "numpy", "scipy", "torchdiffeq"} <= set(header["versions"])
@@ -140,8 +141,8 @@ def test_rewriting_changes_nothing_by_itself(saved):
 
 
 FIELDS = (
-    "conventions", "format", "format_version", "kind", "method", "model", "n_bands", "report", "scene", "strength",
-    "versions", "window",
+    "conventions", "format", "format_version", "kind", "method", "model", "n_bands", "provenance", "rates_meaning", "report",
+    "scene", "strength", "versions", "window",
 )  # fmt: skip
 
 
@@ -154,8 +155,9 @@ def test_every_field_is_needed_and_of_its_type(field, saved):
     refused(saved, field.replace("_", "[_ ]"))
     right = type(header[field])
     for wrong in (None, True, -7, 0.123, 10**400, "other", [], [1], {}, {"a": 1}, [None, 3], [2, 1], [float("nan"), 1]):
-        free = field in ("report", "versions") and isinstance(wrong, dict)
-        free |= field in ("method", "model") and isinstance(wrong, str)
+        free = field == "versions" and isinstance(wrong, dict)
+        free |= field == "report" and wrong == {}
+        free |= field in ("model", "provenance", "rates_meaning") and isinstance(wrong, str)
         if free or (field == "window" and wrong is None):
             continue
         write(saved, {**header, field: wrong}, outer, data)
@@ -189,11 +191,13 @@ def test_every_field_of_the_scene_is_checked(field, saved):
         ({"n_bands": 0}, "hold .* with 0 bands"),
         ({"strength": 0.2}, "state the strength of its scene, got 0.2"),
         ({"strength": float("nan")}, "state the strength of its scene"),
-        ({"format_version": 1}, "have format version 2, got 1"),
-        ({"format_version": 1.5}, "have format version 2"),
+        ({"format_version": 1}, "have format version 3 .*, got 1"),
+        ({"format_version": 2}, "have format version 3 .*, got 2"),
+        ({"format_version": 1.5}, "have format version 3"),
         ({"kind": "memory"}, "hold the tensors amplitudes"),
         ({"kind": "torch.nn.Linear"}, "kind must be one of markov, swing_in, memory"),
-        ({"conventions": {"axes": "rates[receiver, source]"}}, "follow this version's conventions"),
+        ({"conventions": {"axes": "rates[receiver, source]"}}, "follow version 1 of the conventions"),
+        ({"conventions": {"version": 2}}, "follow version 1 of the conventions, got 2"),
         ({"format": "torchchain-scene"}, "carry the format torchchain-master-equation"),
     ],
 )
@@ -371,7 +375,9 @@ def test_places_that_cannot_be_written(tmp_path):
 
 def test_a_report_that_json_cannot_hold(tmp_path):
     spoiled = master(markov())
-    spoiled.calibration = replace(spoiled.calibration, report={"loss": np.inf})
+    spoiled.calibration = replace(
+        spoiled.calibration, report=Report(fit=AdamReport(True, 1, np.inf, 1.0, "exact", 0.0))
+    )
     with pytest.raises(FieldError, match="report must hold finite numbers"):
         spoiled.save(tmp_path / "x.safetensors")
     assert os.listdir(tmp_path) == []

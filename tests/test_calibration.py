@@ -9,6 +9,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
+from torchchain.master import NonlinearReport, Report, Rung
 from torchchain.master.fits import FitWarning, profile
 from torchchain.master.memory import MemoryModel
 
@@ -101,8 +102,8 @@ def test_analytic_fit_recovers_q0():
     q0 = 0.013
     mean = np.stack([np.eye(B) + (1 - psi())[:, None] * q0 * profile(B).numpy() * t for t in TIMES], axis=1)
     master = tc.calibrate(transfer_of(mean), "analytic", "paper")
-    assert master.calibration.report["q0"] == pytest.approx(q0, rel=1e-12)
-    assert master.calibration.report["q0_stderr"] < 1e-14
+    assert master.calibration.report.fit.q0 == pytest.approx(q0, rel=1e-12)
+    assert master.calibration.report.fit.q0_stderr < 1e-14
     np.testing.assert_allclose(master.rates.detach().numpy(), q0 * profile(B).numpy(), rtol=1e-12, atol=1e-16)
     assert master.conservation_defect < 1e-15
 
@@ -127,7 +128,7 @@ def test_nonlinear_fit_of_exponentials(speed):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         master = tc.calibrate(transfer_of(mean), "nonlinear", "paper")
-    assert master.calibration.report == {"unconverged": 0, "unconverged_entries": [], "horizon": 30.0}
+    assert master.calibration.report == Report(fit=NonlinearReport(()), horizon=30.0)
     assert master.calibration.window == (0.5, 4.5)
     # The slope at t0, per free energy; the search stops at 1e-8 relative.
     np.testing.assert_allclose(master.rates.detach().numpy() * (1 - psi())[:, None], slopes, rtol=1e-5)
@@ -140,12 +141,11 @@ def test_nonlinear_fit_reports_where_it_does_not_converge():
     mean[3, :, 0] = 0.01 * np.exp(0.3 * TIMES)  # speeding up: no saturation either
     with pytest.warns(FitWarning, match="did not converge for 3 of 16 pairs of bands"):
         master = tc.calibrate(transfer_of(mean), "nonlinear", "paper")
-    assert master.calibration.report["unconverged"] == 3
-    assert sorted(master.calibration.report["unconverged_entries"]) == [[2, 3], [3, 4], [4, 1]]
+    assert sorted(master.calibration.report.fit.unconverged) == [(2, 3), (3, 4), (4, 1)]
     linear = tc.calibrate(transfer_of(mean), "linear", "paper", (0.5, 4.5)).rates
     expected = slopes / (1 - psi())[:, None]
     for s, r in np.ndindex(B, B):
-        failed = [s + 1, r + 1] in master.calibration.report["unconverged_entries"]
+        failed = (s + 1, r + 1) in master.calibration.report.fit.unconverged
         value = linear[s, r].item() if failed else expected[s, r]
         assert master.rates[s, r].item() == pytest.approx(value, rel=1e-5, abs=1e-12)
 
@@ -176,7 +176,7 @@ def test_adam_recovers_known_rates(model, constraint):
     with warnings.catch_warnings():  # without noise the loss has no floor to converge to
         warnings.simplefilter("ignore", FitWarning)
         master = tc.calibrate(transfer, "adam", model, constraint=constraint, steps=1000)
-    assert master.calibration.report["constraint"] == constraint
+    assert master.calibration.report.fit.constraint == constraint
     # Psi leaves band 1 next to no free energy to tell its rates by: the penalty's valley is long there.
     slow = (model, constraint) == ("paper", "penalty")
     assert distance(master, transfer).mean().item() < (1e-3 if slow else 1e-6)
@@ -208,7 +208,7 @@ def test_the_exact_constraint_holds_whatever_the_data():
     assert free.conservation_defect > 0.01
     assert free.most_negative_rate < 0
     # More freedom fits better; more weight on conservation leaks less.
-    assert free.calibration.report["loss"] < exact.calibration.report["loss"]
+    assert free.calibration.report.fit.loss < exact.calibration.report.fit.loss
     defects = [free.conservation_defect]
     for penalty in (1.0, 1e3, 1e6):
         settings = {"constraint": "penalty", "penalty": penalty, "steps": 200, "tolerance": 1e-3}
@@ -221,15 +221,15 @@ def test_adam_warns_when_it_stops_early():
     transfer = transfer_of(markov(conserving_rates(), np.diag(psi())))
     with pytest.warns(FitWarning, match="Adam did not converge in 5 steps"):
         master = tc.calibrate(transfer, "adam", "paper", steps=5)
-    assert not master.calibration.report["converged"]
-    assert master.calibration.report["steps"] == 5
+    assert not master.calibration.report.fit.converged
+    assert master.calibration.report.fit.steps == 5
 
 
 def test_adam_never_ends_above_where_it_began():
     transfer = transfer_of(markov(conserving_rates(), np.diag(psi())))
     with pytest.warns(FitWarning):
         wild = tc.calibrate(transfer, "adam", "paper", constraint="penalty", learning_rate=10.0, steps=20)
-    assert wild.calibration.report["loss"] <= wild.calibration.report["first_loss"]
+    assert wild.calibration.report.fit.loss <= wild.calibration.report.fit.first_loss
     assert bool(wild.rates.isfinite().all())
 
 
@@ -256,7 +256,7 @@ def test_projection_recovers_rates_and_amplitudes():
     assert isinstance(model, MemoryModel)
     fitted = [model.decay.item(), model.pair_decay.item(), model.pair_frequency.item()]
     np.testing.assert_allclose(fitted, [0.08, 0.3, 0.5], rtol=1e-3)
-    assert master.calibration.report["converged"]
+    assert master.calibration.report.fit.converged
     assert distance(master, transfer_of(mean)).max().item() < 1e-4
     later = np.arange(0, 300.0, 7)  # beyond the data
     expected = memory_data(later)[1]
@@ -269,8 +269,10 @@ def test_projection_chooses_an_order():
     basis, mean = memory_data()
     transfer = transfer_of(mean, long_time=basis, noise=0.01)
     master = tc.calibrate(transfer)
-    assert master.calibration.report["order"] == [1, 1]
-    assert master.calibration.report["tried"][1][:2] == ["memory", [1, 0]]
+    assert master.calibration.report.fit.order == (1, 1)
+    assert master.calibration.report.selection.tried[1] == Rung(
+        "memory", (1, 0), master.calibration.report.selection.tried[1].distance
+    )
     again = tc.calibrate(transfer)
     assert torch.equal(again.model.amplitudes, master.model.amplitudes)
 
@@ -313,7 +315,7 @@ def test_without_disorder_nothing_moves(method, model):
     master = tc.calibrate(tc.band_transfer(ordered, "modes"), method, model)
     shares = master.solve(np.eye(B), [0.0, 50.0, 1e6]).detach().numpy()
     np.testing.assert_array_equal(shares, np.eye(B)[:, None].repeat(3, 1))
-    assert master.calibration.report == {"ordered": True}
+    assert master.calibration.report == Report(ordered=True)
 
 
 @pytest.mark.parametrize("strength", [1e-9, 1e-6, 1e-3])
@@ -379,7 +381,7 @@ def test_no_more_functions_than_the_times_tell_apart():
     short = transfer_of(markov(conserving_rates(), np.diag(psi()), few), few, np.diag(psi()))
     with pytest.raises(FieldError, match=r"order must have at most 3 functions for 6 times, got \(2, 1\)"):
         tc.calibrate(short, order=(2, 1))
-    assert tc.calibrate(short, order=(1, 1)).calibration.report["order"] == [1, 1]
+    assert tc.calibrate(short, order=(1, 1)).calibration.report.fit.order == (1, 1)
 
 
 @pytest.mark.parametrize("model", ["exact_psi", "basis_matrix", "memory"])

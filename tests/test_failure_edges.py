@@ -13,7 +13,7 @@ import torch
 import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.evolvers.symplectic import MOST_STEPS
-from torchchain.master.calibration import Calibration
+from torchchain.master import Calibration
 from torchchain.master.equation import TrustWarning
 from torchchain.master.fits import FitWarning, nonlinear_rates
 from torchchain.modes.phase import PhaseWarning
@@ -67,7 +67,7 @@ def test_well_inside_its_edge_a_method_works(name):
 
 def test_every_stability_limit_of_the_registry_is_on_the_map():
     from torchchain.evolvers import ode
-    from torchchain.master.solvers import STABILITY
+    from torchchain.master.solving import STABILITY
 
     assert {f"{name}: |lambda| step" for name in STABILITY} <= EDGES.keys()
     limited = {solver.name for solver in ode.FIXED if solver.limit is not None and solver.name != "implicit_adams"}

@@ -13,9 +13,11 @@ import xarray
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.master import MasterFamily, TrustWarning, calibrate_family, chapman_kolmogorov, implied_timescales
-from torchchain.master.calibration import recipe, rungs
-from torchchain.master.ladder import Sample, loss_rates
-from torchchain.master.model import SwingInModel, equal_steps, flows
+from torchchain.master.calibration import recipe
+from torchchain.master.model import equal_steps, flows
+from torchchain.master.rates import SwingInModel
+from torchchain.master.sample import Sample, loss_rates
+from torchchain.master.selection import rungs
 
 B = 4
 EYE = torch.eye(B, dtype=torch.float64)
@@ -143,8 +145,10 @@ def test_rungs_come_in_order_of_their_size(small_transfer):
     asked = recipe(small_transfer.scene)
     sizes = []
     for rung in rungs(asked, small_transfer):
-        extra = {} if rung.order is None else {"order": rung.order}
-        sizes.append(tc.calibrate(small_transfer, rung.method, rung.model, bootstrap=0, **extra).model.n_parameters)
+        extra = {"order": rung.order} if rung.order else {}
+        sizes.append(
+            tc.calibrate(small_transfer, rung.fit.name, rung.model.name, bootstrap=0, **extra).model.n_parameters
+        )
     plain = [size for size in sizes if size > small_transfer.n_bands**2]  # a diagonal basis is not counted by the model
     assert plain == sorted(plain)
     assert len(sizes) == len(rungs(asked, small_transfer)) >= 5
@@ -157,15 +161,16 @@ def test_the_smallest_model_that_fits_is_chosen():
     fine = tc.calibrate(transfer_of(mean, basis_matrix(), noise=0.003))
     assert coarse.model.n_parameters < fine.model.n_parameters
     report = fine.calibration.report
-    assert report["tried"][-1][2] <= 1.05 * report["halves_distance"]
-    assert all(distance > 1.05 * report["halves_distance"] for _, _, distance in report["tried"][:-1])
+    tried, halves = report.selection.tried, report.selection.halves_distance
+    assert tried[-1].distance <= 1.05 * halves
+    assert all(rung.distance > 1.05 * halves for rung in tried[:-1])
 
 
 def test_too_few_blocks_hold_nothing_out():
     truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(), basis_matrix())))
     mean = truth.transfer(torch.from_numpy(TIMES)).detach().numpy()
     master = tc.calibrate(transfer_of(mean, basis_matrix(), noise=0.01, blocks=3))
-    assert "too few blocks" in master.calibration.report["selection"]
+    assert "too few blocks" in master.calibration.report.selection.reason
     assert master.uncertainty is None
 
 
@@ -519,7 +524,7 @@ def test_families_refuse(family):
 
 
 def test_families_from_the_command_line(family, tmp_path, capsys):
-    from torchchain.cli.entry import main
+    from torchchain.cli import main
 
     files = []
     for member in family.members:

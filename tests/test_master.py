@@ -9,8 +9,12 @@ import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.master import Calibration, IntegrationError
 from torchchain.master.memory import MemoryModel
-from torchchain.master.solvers import ADAPTIVE, FIXED, ORDERS, STABILITY
+from torchchain.master.solving import STABILITY
+from torchchain.odes import INTEGRATORS
 
+FIXED = tuple(STABILITY)
+ORDERS = {entry.name: entry.order for entry in INTEGRATORS.values() if entry.order and not entry.name.endswith("adams")}
+ADAPTIVE = tuple(name for name in ORDERS if INTEGRATORS[name].adaptive)
 B = 5
 RANDOM = np.random.default_rng(0)
 

@@ -74,7 +74,7 @@ def test_embedding_is_markovian():
 def test_noise_free_model_is_recovered():
     model = known_model()
     tensors, report = fit_memory(TIMES, model.transfer(TIMES), model.basis, (1, 1))
-    assert report["converged"]
+    assert report.converged
     for name in ("decay", "pair_decay", "pair_frequency", "amplitudes"):
         torch.testing.assert_close(tensors[name], getattr(model, name), rtol=0, atol=1e-4)
 
@@ -98,8 +98,8 @@ def test_conservation_is_exact_and_the_artifact_keeps_everything(tmp_path):
 def test_order_is_the_smallest_that_reaches_the_noise():
     master = tc.calibrate(transfer_of(known_model(), noise=1e-3))
     report = master.calibration.report
-    assert report["order"] == [1, 1]
-    assert report["held_out_distance"] <= 1.05 * report["halves_distance"]
+    assert report.fit.order == (1, 1)
+    assert report.selection.held_out_distance <= 1.05 * report.selection.halves_distance
 
 
 def test_infinite_time_is_the_basis():

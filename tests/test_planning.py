@@ -8,14 +8,14 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.cli.entry import main
+from torchchain.cli import main
 from torchchain.ensemble import layout, predictions
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.moving_part import PartExceeded, moving_part
 from torchchain.ensemble.plan import forecast
 from torchchain.ensemble.scene import regular_times
 from torchchain.evolvers import start
-from torchchain.master.coverage import plan
+from torchchain.master.stand_in import plan
 
 
 def scene(**fields):

@@ -2,12 +2,15 @@ import pkgutil
 import subprocess
 import sys
 
+import pytest
+
 import torchchain as tc
 
 
 def test_every_public_name_resolves():
-    assert tc.__all__ == sorted(tc._HOME)
-    for name in tc.__all__:
+    assert tc.__all__ == sorted(tc.__all__)
+    assert set(tc.__all__) <= set(tc._HOME)
+    for name in tc._HOME:
         assert getattr(tc, name) is not None
     assert set(tc.__all__) <= set(dir(tc))
 
@@ -38,3 +41,64 @@ def test_unknown_names():
 def test_importing_the_package_imports_nothing_heavy():
     code = "import sys, torchchain; sys.exit(any(m in sys.modules for m in ('torch', 'numpy', 'xarray', 'matplotlib')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_names_that_were_public_before():
+    earlier = """BandTransfer Chain Disorder Impulse Linearity LinearityWarning METHODS MasterEquation MasterFamily
+        MemoryModel NormalModes Plan RateModel SOLVERS Scaling Scene SwingInModel StandingWave State TrustWarning
+        Trajectory band_energy band_transfer basis_fraction bin_energy calibrate calibrate_family chapman_kolmogorov
+        count_modes_below energy_center energy_matrices energy_moments energy_width evolve implied_timescales impulse
+        integrated_density_of_states kinetic_energy linearity long_time_band_energy lyapunov_exponent normal_modes
+        particle_energy plan potential_energy simulate standing_wave statistical_distance total_energy total_variation
+        wavenumber_energy wavenumber_energy_matrix weak_disorder_lyapunov zero_wavenumber_share""".split()
+    for name in earlier:
+        assert getattr(tc, name) is not None
+
+
+def test_rooms_as_namespaces():
+    assert tc.localization.lyapunov_exponent is tc.lyapunov_exponent
+    assert tc.energy.kinetic_energy is tc.kinetic_energy
+    assert tc.master.chapman_kolmogorov is tc.chapman_kolmogorov
+
+
+SCRIPT = """
+import torchchain as tc
+
+scene = tc.Scene(n_particles=64, n_bands=8)
+transfer = tc.band_transfer(scene)
+master = tc.calibrate(transfer)
+path = tc.evolve(scene.chain([0]), scene.state(scene.chain([0])), scene.times)
+reveal_type(transfer)
+reveal_type(master)
+reveal_type(tc.plan(scene))
+reveal_type(path)
+reveal_type(tc.open("results").transfer)
+reveal_type(tc.localization.lyapunov_exponent)
+tc.Scene(particles=3)
+tc.nothing
+"""
+
+
+def test_a_type_checker_knows_what_a_name_is(tmp_path):
+    mypy = pytest.importorskip("mypy.api", reason="mypy comes with the extra dev")
+    script, config = tmp_path / "script.py", tmp_path / "mypy.ini"
+    script.write_text(SCRIPT)
+    libraries = [
+        "torch",
+        "numpy",
+        "scipy",
+        "xarray",
+        "matplotlib",
+        "numba",
+        "torchdiffeq",
+    ]  # large, and not in question
+    skipped = "".join(f"[mypy-{name}.*]\nfollow_imports = skip\n" for name in libraries)
+    config.write_text(f"[mypy]\nignore_missing_imports = True\nfollow_imports = silent\n{skipped}")
+    report, _, _ = mypy.run([str(script), f"--config-file={config}", f"--cache-dir={tmp_path}"])
+    revealed = [line.partition('"')[2].rstrip('"') for line in report.splitlines() if "Revealed type" in line]
+    expected = ("BandTransfer", "MasterEquation", "Plan", "Trajectory", "BandTransfer", "def (")
+    assert len(revealed) == len(expected), report
+    for kind, name in zip(revealed, expected, strict=True):
+        assert name in kind
+    assert "Unexpected keyword argument" in report
+    assert 'Module has no attribute "nothing"' in report

@@ -173,6 +173,24 @@ def test_cross_terms_of_a_pair_of_equal_frequency():
     assert abs(wrong[0].numpy() - expected).max() > 0.01
 
 
+@pytest.mark.parametrize("light", [2, 3, 6])
+def test_equal_light_beads_far_apart_share_one_frequency(light):
+    # Each swings by itself, so that all their modes have one frequency to rounding, and the solver any basis of them.
+    n = 12 * light
+    masses = torch.ones(1, n, dtype=torch.float64)
+    masses[0, 5::12] = 1e-3
+    chain = tc.Chain(masses)
+    top = tc.normal_modes(chain).frequencies[0, -light:]
+    assert (top - top[-1]).abs().max() < 1e-13 * top[-1]
+    state = random_state((1, n), seed=3)
+    late = tc.long_time_band_energy(chain, state, light)[0]
+    matrix = literal.stiffness_matrix(np.ones(n), n, "periodic")
+    expected = literal.long_time_band_energy(
+        masses[0].numpy(), matrix, state.displacement[0].numpy(), state.velocity[0].numpy(), light
+    )
+    np.testing.assert_allclose(late.numpy(), expected, atol=1e-10)
+
+
 def test_a_traveling_wave_on_the_ordered_ring():
     # Its sine and its cosine part are a pair of equal frequency, in whatever basis the solver chose.
     chain = tc.Chain(torch.ones(1, N, dtype=torch.float64))

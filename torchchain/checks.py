@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchchain.spelling import suggestion
+
 
 class FieldError(ValueError):
     """A value that breaks a rule: the message reads ``field must rule, got value``."""
@@ -79,7 +81,7 @@ def choice(field: str, value: Any, choices: Iterable[str]) -> str:
     if not isinstance(value, str):
         raise FieldTypeError(f"{field} must be a string, one of {', '.join(choices)}, got {shown(value)}")
     if value not in choices:
-        raise fail(field, f"be one of {', '.join(choices)}", repr(value))
+        raise fail(field, f"be one of {', '.join(choices)}", repr(value) + suggestion(value, choices))
     return value
 
 
@@ -113,7 +115,8 @@ def known_keys(field: str, given: Iterable[str], allowed: Iterable[str]) -> None
     allowed = tuple(allowed)
     for key in given:
         if key not in allowed:
-            raise fail(field, f"have only the keys {', '.join(allowed) or '(none)'}", repr(key))
+            told = suggestion(key, allowed) if isinstance(key, str) else ""
+            raise fail(field, f"have only the keys {', '.join(allowed) or '(none)'}", repr(key) + told)
 
 
 def real_tensor(field: str, value: Any) -> Tensor:
@@ -132,9 +135,21 @@ def real_tensor(field: str, value: Any) -> Tensor:
     return value
 
 
+def is_transformed(values: Tensor) -> bool:
+    """Whether ``torch.func.grad`` or ``vmap`` traces the tensor: its values are not to be looked at, and pass all checks."""
+    return torch._C._functorch.is_functorch_wrapped_tensor(values)  # there is no public way
+
+
+def traced_values(values: Tensor) -> Tensor:
+    """The numbers inside what ``torch.func`` traces, with an axis more for every ``vmap``; for bounds that hold for all."""
+    while is_transformed(values):
+        values = torch._C._functorch.get_unwrapped(values)
+    return values
+
+
 def finite(field: str, values: Tensor, axis: str = "position") -> Tensor:
     """The values, if all are finite numbers; one pass over them, where they are."""
-    if not bool(values.detach().sum().isfinite()):  # also where only the sum overflows
+    if not is_transformed(values) and not bool(values.detach().sum().isfinite()):  # also where only the sum overflows
         first_bad(field, "be finite", values, ~values.isfinite(), axis)
     return values
 
@@ -159,10 +174,16 @@ def is_collection(value: Any) -> TypeGuard[Iterable[Any]]:
 
 def first_bad(field: str, rule: str, values: Tensor, bad: Tensor, axis: str = "position") -> None:
     """An error that names the first entry of ``values`` where ``bad`` holds: ``at realization 2, particle 17``."""
-    if not bool(bad.any()):
-        return
-    where = tuple(int(i) for i in bad.nonzero()[0])
-    raise fail(field, rule, f"{values[where].item():.6g}{position(where, axis)}")
+    where = first(bad)
+    if where is not None:
+        raise fail(field, rule, f"{values[where].item():.6g}{position(where, axis)}")
+
+
+def first(condition: Tensor) -> tuple[int, ...] | None:
+    """Index of the first entry at which a condition holds; None where it holds nowhere, or is traced."""
+    if is_transformed(condition) or not bool(condition.any()):
+        return None
+    return tuple(int(i) for i in condition.nonzero()[0])
 
 
 def position(index: tuple[int, ...], axis: str | None = None) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TIME_LABEL = "time t"
 BAND_LABEL = "wavenumber band r"
@@ -16,6 +17,8 @@ BAND_LABEL = "wavenumber band r"
 def band_map(ax: Axes, times: np.ndarray, energy: np.ndarray, title: str = "", floor: float = 1e-3) -> Axes:
     """Share of the energy over time and band (as Figs. 12 and 18), energy [time, band], logarithmic colors."""
     bands = np.arange(1, energy.shape[-1] + 1)
+    from matplotlib.colors import LogNorm
+
     image = ax.pcolormesh(
         times, bands, np.maximum(energy.T, floor), norm=LogNorm(floor, 1.0), shading="nearest", rasterized=True
     )
@@ -29,6 +32,8 @@ def field_map(
     title: str = "", limit: float | None = None, signed: bool = False,
 ) -> Axes:  # fmt: skip
     """Any quantity over two axes (as Figs. 9 to 11), values [x, y]; colors end at ``limit``."""
+    from matplotlib.colors import Normalize
+
     top = float(np.abs(values).max()) if limit is None else limit
     norm = Normalize(-top if signed else 0.0, top or 1.0)
     image = ax.pcolormesh(
@@ -44,6 +49,8 @@ def log_map(
     title: str = "", floor: float = 1e-4, top: float = 1.0,
 ) -> Axes:  # fmt: skip
     """A share of the energy over two axes (as Figs. 10 and 11), values [x, y], logarithmic colors; less is drawn as the floor."""
+    from matplotlib.colors import LogNorm
+
     image = ax.pcolormesh(
         x, y, np.maximum(values.T, floor), norm=LogNorm(floor, top), shading="nearest", rasterized=True
     )
@@ -58,6 +65,8 @@ def rate_map(ax: Axes, rates: np.ndarray, title: str = "", top: float | None = N
     bands = np.arange(1, len(rates) + 1)
     top = float(shown.max()) if top is None else top
     top = top if top > 0 else 1.0
+    from matplotlib.colors import LogNorm
+
     image = ax.pcolormesh(
         bands, bands, np.clip(shown, top * 1e-4, None), norm=LogNorm(top * 1e-4, top), shading="nearest"
     )

@@ -74,7 +74,7 @@ class Chain:
 
     @property
     def n_contacts(self) -> int:
-        return self.n_particles + (self.boundary == "fixed")
+        return self.n_particles + (not self.is_free)
 
     @property
     def contact_stiffness(self) -> Tensor:
@@ -92,14 +92,25 @@ class Chain:
 
     @property
     def is_damped(self) -> bool:
-        return bool((torch.as_tensor(self.damping) > 0).any())
+        return checks.first(torch.as_tensor(self.damping) > 0) is not None
+
+    @property
+    def is_free(self) -> bool:
+        """Whether nothing holds the chain, so that it can move as a whole: a ring."""
+        return self.boundary == "periodic"
+
+    @property
+    def rigid_mass(self) -> Tensor:
+        """The mass that a rigid motion moves, (*batch,): that of a ring; infinite between walls, which allow none."""
+        total = self.masses.sum(-1)
+        return total if self.is_free else torch.full_like(total, torch.inf)
 
     @property
     def is_uniform_ring(self) -> bool:
         """Periodic, with equal linear contacts: the stiffness is diagonal in wavenumber space."""
-        if self.boundary != "periodic" or self.contact != "linear":
-            return False
         stiffness = torch.as_tensor(self.stiffness)
+        if not self.is_free or self.contact != "linear" or checks.is_transformed(stiffness):
+            return False
         return bool((stiffness == stiffness.flatten()[0]).all())
 
     def align(self, values: Tensor, field: Tensor) -> Tensor:
@@ -115,17 +126,38 @@ class Chain:
             return values
         return values.reshape(*self.batch_shape, *[1] * (field.ndim - batch - 1), values.shape[-1])
 
+    # The shape of a chain is in the following five: elongations A u with the incidence matrix A, forces -A^T T, the same
+    # without signs, and the contacts in the order in which kernels walk along them.
+
     def elongation(self, displacement: Tensor) -> Tensor:
         """Change of length of every contact, (*batch, *any, contact): right minus left displacement, walls at 0."""
-        if self.boundary == "periodic":
+        if self.is_free:
             return displacement - displacement.roll(1, -1)
         return torch.nn.functional.pad(displacement, (1, 1)).diff(dim=-1)
 
     def net(self, tension: Tensor) -> Tensor:
         """Force on every particle, (*batch, *any, particle): tension of its right contact minus that of its left."""
-        if self.boundary == "periodic":
-            return tension.roll(-1, -1) - tension
-        return tension.diff(dim=-1)
+        return tension.roll(-1, -1) - tension if self.is_free else tension.diff(dim=-1)
+
+    def of_both_ends(self, field: Tensor) -> Tensor:
+        """A quantity of the particles summed over both ends of every contact, (*batch, *any, contact); walls have none."""
+        if self.is_free:
+            return field + field.roll(1, -1)
+        padded = torch.nn.functional.pad(field, (1, 1))
+        return padded[..., 1:] + padded[..., :-1]
+
+    def of_both_contacts(self, field: Tensor) -> Tensor:
+        """A quantity of the contacts summed over both of every particle, (*batch, *any, particle)."""
+        return field + field.roll(-1, -1) if self.is_free else field[..., 1:] + field[..., :-1]
+
+    def in_a_row(self, field: Tensor) -> Tensor:
+        """A quantity of the contacts on the left of particle 1, 2, ..., N and on the right of N, (*batch, N + 1)."""
+        return torch.cat([field, field[..., :1]], dim=-1) if self.is_free else field
+
+    def rigid_displacement(self, displacement: Tensor) -> Tensor:
+        """How far the chain has moved as a whole, the mean by mass, (*batch, *any, 1); 0 between walls."""
+        moment = (self.align(self.masses, displacement) * displacement).sum(-1, keepdim=True)
+        return moment / self.align(self.rigid_mass[..., None], displacement)
 
     def tension(self, elongation: Tensor) -> Tensor:
         """Pull of every contact relative to the precompressed state, (*batch, *any, contact)."""
@@ -174,25 +206,19 @@ class Chain:
         closed = q * q * (3 - 4 * q + 2 * q * q - 0.4 * q**3)
         return stiffness * (2 / 3) * (closed + (elongation - 1).clamp(min=0))
 
+    def energy(self, displacement: Tensor, velocity: Tensor) -> Tensor:
+        """Energy of the chain relative to the precompressed state (Eq. 41), (*batch, *any)."""
+        kinetic = (self.align(self.masses, velocity) * velocity.square()).sum(-1) / 2
+        return kinetic + self.contact_energy(displacement).sum(-1)
+
     def open_contacts(self, displacement: Tensor) -> Tensor:
         """Whether each contact is open (the elongation has used up the initial overlap 1), (*batch, *any, contact)."""
         return self.elongation(displacement) >= 1
 
     def stiffness_matrix(self) -> Tensor:
         """K of Eq. 13, symmetric and negative semidefinite, (*batch, particle, particle)."""
-        n = self.n_particles
-        stiffness = self.contact_stiffness
-        left = stiffness if self.boundary == "periodic" else stiffness[..., :-1]
-        right = stiffness.roll(-1, -1) if self.boundary == "periodic" else stiffness[..., 1:]
-        matrix = torch.diag_embed(-(left + right))
-        i = torch.arange(n - 1, device=matrix.device)
-        inner = left[..., 1:]
-        matrix[..., i, i + 1] = inner
-        matrix[..., i + 1, i] = inner
-        if self.boundary == "periodic":  # added, not set: two particles share both contacts
-            matrix[..., 0, n - 1] += stiffness[..., 0]
-            matrix[..., n - 1, 0] += stiffness[..., 0]
-        return matrix
+        unit = torch.eye(self.n_particles, dtype=self.masses.dtype, device=self.masses.device)
+        return self.net(self.contact_stiffness[..., None, :] * self.elongation(unit))
 
     def squared_frequency_bound(self, sweeps: int = 30) -> Tensor:
         """A rigorous upper bound on every squared frequency of the linear chain, (*batch,).
@@ -205,13 +231,7 @@ class Chain:
         x = torch.ones_like(self.masses)
         ratio = x
         for _ in range(sweeps + 1):
-            if self.boundary == "periodic":
-                sums = stiffness * (x + x.roll(1, -1))
-                image = (sums + sums.roll(-1, -1)) / self.masses
-            else:
-                padded = torch.nn.functional.pad(x, (1, 1))
-                sums = stiffness * (padded[..., 1:] + padded[..., :-1])
-                image = (sums[..., 1:] + sums[..., :-1]) / self.masses
+            image = self.of_both_contacts(stiffness * self.of_both_ends(x)) / self.masses
             ratio = image / x
             # The geometric mean of x and its image stays positive and does not alternate between neighbors.
             x = (x * image).sqrt()

@@ -51,6 +51,27 @@ class Trajectory:
     dissipated: Tensor | None = None
     openings: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        checks.instance("trajectory.times", self.times, Tensor)
+        if self.times.ndim != 1:
+            raise checks.fail("trajectory.times", "be one-dimensional", f"shape {tuple(self.times.shape)}")
+        for field in ("displacement", "velocity"):
+            value = getattr(self, field)
+            checks.instance(f"trajectory.{field}", value, Tensor)
+            if value.dtype not in (torch.float32, torch.float64) or value.layout != torch.strided or value.is_meta:
+                raise checks.FieldTypeError(
+                    f"trajectory.{field} must be a dense tensor of float32 or float64, got {value.dtype} on {value.device}"
+                )
+        shape = self.displacement.shape
+        if len(shape) < 2 or shape[-2] != len(self.times):
+            rule = f"have shape (*batch, time, particle) with {len(self.times)} times"
+            raise checks.fail("trajectory.displacement", rule, f"shape {tuple(shape)}")
+        for field, expected in (("velocity", shape), ("dissipated", shape[:-1]), ("openings", shape[:-1])):
+            value = getattr(self, field)
+            if value is not None and value.shape != expected:
+                rule = f"have shape {tuple(expected)} beside the displacement"
+                raise checks.fail(f"trajectory.{field}", rule, f"shape {tuple(value.shape)}")
+
     @property
     def final(self) -> State:
         """The state at the last time."""

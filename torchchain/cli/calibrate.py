@@ -7,7 +7,6 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,16 +16,17 @@ import torch
 from torchchain import checks, plots
 from torchchain.cli import outputs
 from torchchain.cli.flags import Calibrate
-from torchchain.cli.runs import how, keeping, merged_tables, out_and_device, scene_of
+from torchchain.cli.runs import Run, config_of, merged_tables, running, scene_of
 from torchchain.ensemble import plan as planning
-from torchchain.ensemble import ranks
-from torchchain.ensemble.checkpoint import Checkpoint
-from torchchain.ensemble.scene import Scene, describe
-from torchchain.ensemble.stages import Stages
+from torchchain.ensemble.scene import describe
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer, band_transfer
-from torchchain.master import MasterEquation, calibrate
+from torchchain.master import Calibration, MasterEquation, calibrate
 from torchchain.master.calibration import recipe
+from torchchain.master.ladder import methods
+from torchchain.master.paper_rates import paper_rates
+from torchchain.progress import log
+from torchchain.results import read_transfer
 
 
 def run_calibrate(
@@ -37,79 +37,92 @@ def run_calibrate(
     Args:
         flags, arguments, options, keep: as for :func:`run_simulate`.
     """
-    began = time.time()
-    scene, extra = scene_of(flags, ("calibration",))
-    table = extra.get("calibration", {})
+    config, loaded = config_of(flags.config, flags.plugin)
+    settings = _settings(config.pop("calibration", {}), flags)
+    if flags.transfer is not None:
+        for name in {**config, **flags.overrides()}:
+            raise checks.fail(name, "not be given together with transfer, which is of a scene already", repr(name))
+        path, transfer = read_transfer(flags.transfer)
+        recipe(transfer, **settings)
+        with running(flags, arguments, loaded, options, keep=False) as run:
+            source = {"transfer": {"path": str(path.resolve()), "sha256": outputs.sha256(path)}}
+            _leave(run, transfer, settings, None, source)
+        return
+    scene = scene_of(config, flags)
+    recipe(scene, **settings)  # before the ensemble is computed
+    with running(flags, arguments, loaded, options, keep) as run:
+        found = run.measured(band_transfer, scene)
+        if found is not None:
+            assert found.scene is not None, "of a simulation"
+            measured = replace(found.scene, observables=("band_energy", "long_time_band_energy"))
+            forecast = planning.forecast(measured, found.attributes, run.spent, float(found.stderr.max()))
+            _leave(run, found, settings, forecast, run.how(found.attributes))
+
+
+def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:
+    """How to fit: the config's table and the flags over it."""
     if not isinstance(table, Mapping):
         raise checks.FieldTypeError(f"calibration must be a table, got {checks.shown(table)}")
     settings = merged_tables(table, flags.calibration())
-    checks.known_keys("calibration", settings, ("method", "model", "window", "constraint", "penalty", "steps", "learning_rate", "tolerance", "order", "bootstrap"))  # fmt: skip
+    fits = [name for fit in methods().values() for name in fit.settings_names]
+    checks.known_keys("calibration", settings, ("method", "model", "window", "bootstrap", *dict.fromkeys(fits)))
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])
-    out, device = out_and_device(flags)
-    recipe(scene, **settings)  # before the ensemble is computed
-    checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
-    with keeping(checkpoint):
-        _calibrate(flags, scene, settings, out, device, arguments, options, checkpoint, began)
+    return settings
 
 
-def _calibrate(
-    flags: Calibrate, scene: Scene, settings: dict[str, Any], out: Path, device: str, arguments: list[str],
-    options: dict[str, Any] | None, checkpoint: Checkpoint | None, began: float,
-) -> None:  # fmt: skip
-    stages = Stages()
-    with ranks.process_group(device) as group:
-        before = time.time()
-        transfer = band_transfer(
-            scene, flags.method, device=device, progress=True, stages=stages, options=options, checkpoint=checkpoint,
-            ranks=group,
-        )  # fmt: skip
-        spent = time.time() - before
-    if group.rank:
-        return
-    measured = replace(transfer.scene, observables=("band_energy", "long_time_band_energy"))
-    forecast = planning.forecast(measured, transfer.attributes, spent, float(transfer.stderr.max()))
-    with stages("calibration"), warnings.catch_warnings(record=True) as caught:
+def _leave(
+    run: Run, transfer: BandTransfer, settings: dict[str, Any], forecast: dict[str, Any] | None, source: dict[str, Any]
+) -> None:
+    """Fit, predict, compare, draw, write and tell."""
+    stages = run.stages
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        master = calibrate(transfer, progress=True, **settings)
-    with stages("prediction"):
-        predicted = master.solve(torch.eye(master.n_bands, dtype=torch.float64), transfer.times).detach()
-    with stages("comparison"):
-        rows = comparison(transfer, master, predicted)
-    with stages("figure"):
-        figure = calibration_figure(transfer, master, predicted)
-    data = transfer.to_dataset()
-    data["prediction"] = data["band_energy"].copy(data=predicted.numpy())
-    data["prediction"].attrs["long_name"] = "share of the energy predicted by the master equation"
-    done = master.calibration
+        log.info("calibrating on %d bands and %d times", transfer.n_bands, len(transfer.times))
+        with stages("calibration"):
+            master = calibrate(transfer, progress=True, **settings)
+        with stages("prediction"):
+            predicted = master.solve(torch.eye(master.n_bands, dtype=torch.float64), transfer.times).detach()
+        with stages("comparison"):
+            rows = comparison(transfer, master, predicted)
+        log.info("drawing and writing")
+        with stages("figure"):
+            figure = calibration_figure(transfer, master, predicted)
+    done = fitted(master)
     chosen = {**settings, "method": done.method, "model": done.model, "window": list(done.window or ())}
-    config = transfer.scene.to_toml() + "\n" + tomli_w.dumps({"calibration": chosen})
-    with stages("writing"):
-        outputs.write(
-            out,
-            {
-                "config.toml": outputs.text(config),
-                "transfer.nc": outputs.dataset(data),
-                "model.safetensors": master.save,
-                "figure.png": outputs.figure(figure),
-                "run.json": outputs.run_record(
-                    arguments, config, device, began, stages.seconds, seed=scene.seed,
-                    **how(flags, transfer.attributes, group, checkpoint), forecast=forecast, summary=dict(rows),
-                ),
-            },
-        )  # fmt: skip
-    if checkpoint is not None:
-        checkpoint.clear()
-    print(describe(transfer.scene))
-    print(planning.forecast_line(forecast))
+    scene = [] if transfer.scene is None or "transfer" in source else [transfer.scene.to_toml()]
+    seed = None if transfer.scene is None else transfer.scene.seed
+    files = {
+        "transfer.nc": outputs.dataset(transfer.to_dataset()),
+        "model.safetensors": master.save,
+        "figure.png": outputs.figure(figure),
+    }
+    config = run.config(*scene, tomli_w.dumps({"calibration": chosen}))
+    run.write(files, config, seed=seed, **source, forecast=forecast, summary=dict(rows))
+    print(title(transfer))
+    run.told(forecast)
     for warning in caught:
         print(f"warning: {warning.message}")
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         print(f"{name:<{width}}  {value:.4g}" if isinstance(value, float) else f"{name:<{width}}  {value}")
     print("seconds: " + ", ".join(f"{name} {seconds:.2f}" for name, seconds in stages.seconds.items()))
-    print(f"{time.time() - began:.1f} s, results in {out}")
+    print(f"{time.time() - run.began:.1f} s, results in {run.flags.out}")
+
+
+def fitted(master: MasterEquation) -> Calibration:
+    """How the model came to be, which :func:`calibrate` always tells."""
+    assert master.calibration is not None
+    return master.calibration
+
+
+def title(transfer: BandTransfer) -> str:
+    """Where the transfer is from, in one line."""
+    if transfer.scene is not None:
+        return describe(transfer.scene)
+    words = transfer.provenance.words if transfer.provenance is not None else ""
+    return f"{words or 'band transfer'}, {transfer.n_bands} bands, {len(transfer.times)} times"
 
 
 def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.Tensor) -> list[tuple[str, Any]]:
@@ -119,41 +132,27 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
     end = float(transfer.times[-1])
     late = transfer.times > end / 2
     early = ~late & (transfer.times > 0)
+    done = fitted(master)
     rows: list[tuple[str, Any]] = [
-        (
-            "model",
-            f"{master.calibration.model}, fitted by {master.calibration.method}, {master.model.n_parameters} parameters",
-        ),
-        *([("conservation defect", master.model.conservation_defect)] if transfer.scene.damping == 0 else []),
+        ("model", f"{done.model}, fitted by {done.method}, {master.n_parameters} parameters"),
+        *([("chosen", done.report.selection.reason)] if done.report.selection is not None else []),
+        *([("conservation defect", master.model.conservation_defect)] if transfer.damping == 0 else []),
         ("lowest predicted share of energy", float(predicted.min())),
     ]
-    report = master.calibration.report
-    if "selection" in report:
-        rows.insert(1, ("chosen", report["selection"]))
-    if "damping" in report:
-        lost = 1 - transfer.mean.sum(-1)
-        rows.append(
-            (
-                "energy lost: root mean square error of the prediction",
-                float((1 - predicted.sum(-1) - lost).square().mean().sqrt()),
-            )
-        )
-    rows.append(
-        ("compared with chains up to", "infinite time" if master.horizon == math.inf else f"t = {master.horizon:g}")
-    )
+    if done.report.loss is not None:
+        lost = transfer.mean.sum(-1) - predicted.sum(-1)
+        rows.append(("energy lost: root mean square error of the prediction", float(lost.square().mean().sqrt())))
+    compared = "infinite time" if master.horizon == math.inf else f"t = {master.horizon:g}"
+    rows.append(("compared with chains up to", compared))
     if bool(early.any()):
         rows.append((f"total variation to the ensemble, 0 < t <= {end / 2:g}", float(distance[:, early].mean())))
     if bool(late.any()):
         rows.append((f"total variation to the ensemble, {end / 2:g} < t <= {end:g}", float(distance[:, late].mean())))
-        rows.append(
-            (
-                "statistical error: total variation of two such ensembles",
-                float(statistical[:, transfer.times > 0].mean()),
-            )
-        )
-    rows.append(
-        ("masses: realized mean, standard deviation", "{mass_mean:.5f}, {mass_sd:.5f}".format(**transfer.attributes))
-    )
+        mean = float(statistical[:, transfer.times > 0].mean())
+        rows.append(("statistical error: total variation of two such ensembles", mean))
+    if "mass_mean" in transfer.attributes:
+        realized = "{mass_mean:.5f}, {mass_sd:.5f}".format(**transfer.attributes)
+        rows.append(("masses: realized mean, standard deviation", realized))
     return rows
 
 
@@ -168,29 +167,33 @@ def calibration_figure(transfer: BandTransfer, master: MasterEquation, predicted
         plots.band_map(axes[row, 0], times, mean[source - 1], f"ensemble, source band {source}")
         plots.band_map(axes[row, 1], times, model[source - 1], f"master equation, source band {source}")
         other = max(1, source - 3)
-        plots.decay_comparison(
-            axes[row, 2],
-            times,
-            mean,
-            stderr,
-            model,
-            list(dict.fromkeys([(source, source), (source, other)])),
-            f"source band {source}",
-        )
-    plots.rate_map(axes[2, 0], master.rates.detach().numpy(), "rates Q (diagonal: loss)")
-    plots.distance_curve(
-        axes[2, 1],
-        times,
-        total_variation(predicted, transfer.mean).numpy(),
-        statistical_distance(transfer.stderr).numpy(),
-        "distance of model and ensemble",
-    )
+        pairs = list(dict.fromkeys([(source, source), (source, other)]))
+        plots.decay_comparison(axes[row, 2], times, mean, stderr, model, pairs, f"source band {source}")
+    rates, error, meaning = _rates(transfer, master)
+    plots.rate_map(axes[2, 0], rates, f"{meaning} (diagonal: loss)")
+    distance, noise = total_variation(predicted, transfer.mean), statistical_distance(transfer.stderr)
+    plots.distance_curve(axes[2, 1], times, distance.numpy(), noise.numpy(), "distance of model and ensemble")
     ax = axes[2, 2]
     bands = np.arange(1, n + 1)
-    ax.plot(bands, -master.rates.detach().diagonal().numpy(), "o", label="loss rate $-Q_{ss}$")
-    off = master.rates.detach() - torch.diag(master.rates.detach().diagonal())
-    ax.plot(bands, off.sum(-1).numpy(), "-", label=r"$\sum_{r \neq s} Q_{sr}$")
+    ax.errorbar(bands, -rates.diagonal(), error, fmt="o", label="loss rate $-Q_{ss}$")
+    ax.plot(bands, rates.sum(-1) - rates.diagonal(), "-", label=r"$\sum_{r \neq s} Q_{sr}$")
     ax.set(xlabel="source s", ylabel="rate", title="conservation")
     ax.legend(fontsize="small")
-    figure.suptitle(f"{describe(transfer.scene)}; model {master.calibration.model}, {master.calibration.method}")
+    done = fitted(master)
+    figure.suptitle(f"{title(transfer)}; model {done.model}, {done.method}")
     return figure
+
+
+def _rates(transfer: BandTransfer, master: MasterEquation) -> tuple[np.ndarray, np.ndarray | None, str]:
+    """The paper's Q of the ensemble, the standard error of its diagonal, and its name; where it has none, the model's."""
+    try:
+        found = paper_rates(transfer)
+    except checks.FieldError:  # too few times early on, or an unknown disorder
+        return master.rates.detach().numpy(), None, master.rates_meaning
+    error = found["rates_stderr"].values.diagonal()
+    window = " to ".join(f"{time:g}" for time in found.attrs["window"])
+    return (
+        found["rates"].values,
+        error if np.isfinite(error).all() else None,
+        f"the paper's Q, procedure L, t = {window}",
+    )

@@ -4,44 +4,60 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import os
-import re
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import tyro
 
-from torchchain.cli.flags import COMMANDS
+from torchchain._version import __version__
+from torchchain.cli import flags as known
+from torchchain.cli.mistakes import one_line
 
 DESCRIPTION = """Wave energy in disordered granular chains: exact ensembles, and the master equation calibrated from them.
-A flag overrides the config file, the config file overrides the defaults, which are the paper's case."""
+A flag overrides the config file, the config file overrides the defaults, which are the paper's case.
+torchchain COMMAND --help lists the flags of a command, torchchain --version says which version this is."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+def program(arguments: list[str]) -> int:
+    """The command as a process of its own: warnings, turned into errors or not, are lines and cost no result."""
+    warnings.resetwarnings()
+    warnings.simplefilter("ignore")
+    warnings.simplefilter("default", UserWarning)
+    warnings.simplefilter("default", RuntimeWarning)
+    status = command(arguments, signals=True)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left to save
+    return status
 
-    Returns:
-        The exit status: 2 for bad input, 1 for a failed computation or a rerun that differs, 130 for an interrupt
-        (Ctrl-C), 143 for the signal to end.
-    """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+
+def command(arguments: list[str], signals: bool = False) -> int:
+    """Run one command; returns the exit status."""
+    if arguments == ["--version"]:
+        print(f"torchchain {__version__}")
+        return 0
     try:
         flags = _parse(arguments)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 2
-    with _one_line_warnings(), _ends() as ends:
+    with _one_line_warnings(), _notices(), _ends() as ends:
         try:
             from torchchain.checks import FieldError, FieldTypeError
             from torchchain.cli import dispatch  # torch and the rest, once the flags are known to be good
 
+            if signals and threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, signal.default_int_handler)
             try:
                 return dispatch.run(flags, arguments)
             except (FieldError, FieldTypeError) as error:
                 return complain(str(error), 2)
+            except BrokenPipeError:
+                raise
             except (RuntimeError, MemoryError) as error:  # a solver that gives up, or no memory left
                 return complain(str(error) or type(error).__name__, 1)
         except KeyboardInterrupt as stop:
@@ -80,13 +96,36 @@ def _one_line_warnings() -> Iterator[None]:
         warnings.formatwarning = before
 
 
+class _Notices(logging.Handler):
+    """Notices of the library as lines on standard error; those that only say what goes on where a person looks on."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno >= logging.WARNING or sys.stderr.isatty():
+            with contextlib.suppress(OSError, ValueError):  # nobody reads them any more
+                print(f"torchchain: {record.getMessage()}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _notices() -> Iterator[None]:
+    log, handler = logging.getLogger("torchchain"), _Notices()
+    before = log.level, log.propagate
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.level, log.propagate = before
+
+
 def _parse(arguments: list[str]) -> Any:
     """The flags as a record; a mistake is one line on standard error."""
     caught = io.StringIO()
     try:
         with contextlib.redirect_stderr(caught):
             return tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
+                known.COMMANDS,
                 args=arguments,
                 prog="torchchain",
                 description=DESCRIPTION,
@@ -94,20 +133,8 @@ def _parse(arguments: list[str]) -> Any:
             )
     except SystemExit as stop:
         if stop.code:
-            complain(one_line(caught.getvalue()), 2)
+            complain(one_line(caught.getvalue(), arguments), 2)
         raise
-
-
-def one_line(report: str) -> str:
-    """The parser's boxed report as one line: flag, rule, value."""
-    lines = [line.strip("│╭╮╰╯─ ").strip() for line in report.splitlines()]
-    text = " ".join(line for line in lines if line.strip("-"))
-    text = re.sub(r"\s*(For full helptext|Argument helptext|Got errors).*", "", text)
-    value = re.search(r"Error parsing (\S+): .*?no type matching (.*?) could be instantiated from \[(.*?)\]", text)
-    if value:
-        kind = value[2].replace("{None}|", "").strip("{}")
-        return f"{value[1]} must be {kind}, got {value[3]}"
-    return text
 
 
 def complain(message: str, status: int) -> int:

@@ -11,6 +11,7 @@ from torchchain import checks
 from torchchain.cli import outputs
 from torchchain.cli.flags import Family
 from torchchain.master import MasterEquation, MasterFamily
+from torchchain.results import model_file
 
 
 def run_family(flags: Family, arguments: list[str]) -> None:
@@ -18,8 +19,13 @@ def run_family(flags: Family, arguments: list[str]) -> None:
     began = time.time()
     if not flags.models:
         raise checks.fail("models", "be at least one file", "none")
-    out = outputs.check_writable(flags.out)
-    family = MasterFamily([MasterEquation.load(path) for path in flags.models])
+    paths = [model_file(path) for path in flags.models]
+    with outputs.run_folder(flags.out) as out:
+        _join(paths, out, arguments, began)
+
+
+def _join(paths: list[Path], out: Path, arguments: list[str], began: float) -> None:
+    family = MasterFamily([MasterEquation.load(path) for path in paths])
     times = torch.linspace(0, 500, 101, dtype=torch.float64)[1:]
     left_out = family.leave_one_out(times)
     outputs.write(
@@ -28,7 +34,7 @@ def run_family(flags: Family, arguments: list[str]) -> None:
             "model.safetensors": family.save,
             "run.json": outputs.run_record(
                 arguments, "", "cpu", began, {}, strengths=list(family.strengths), left_out=left_out,
-                models=[{"path": str(Path(path).resolve()), "sha256": outputs.sha256(path)} for path in flags.models],
+                models=[{"path": str(path.resolve()), "sha256": outputs.sha256(path)} for path in paths],
             ),
         },
     )  # fmt: skip

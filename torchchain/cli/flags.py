@@ -1,4 +1,4 @@
-"""The flags of every command, as typed records."""
+"""The flags of every command, as typed records; None is a flag that was not given."""
 
 from __future__ import annotations
 
@@ -8,185 +8,199 @@ from typing import Annotated, Any
 
 import tyro
 
+from torchchain.cli import choices
+
+
+def flag(values: str | tuple[str, ...], default: Any = None, about: str | None = None) -> Any:
+    """How help shows a flag: what it takes, a kind of value or its choices, and its default outside the config file."""
+    shown = values if isinstance(values, str) else f"{{{','.join(values)}}}"
+    hint = "" if default is None else f"(default: {default})"
+    return tyro.conf.arg(metavar=shown, help_behavior_hint=hint, help=about)
+
+
+MEASURED = f"what to measure: {', '.join(choices.OBSERVABLES)}, or of a plugin"
+
 
 @dataclass(frozen=True)
 class DisorderFlags:
     """Disorder of the masses."""
 
-    kind: str | None = None
-    """normal (default), uniform, binary, lognormal or gamma"""
-    strength: float | None = None
-    """standard deviation xi in mean masses (default 0.3)"""
-    lower: float | None = None
-    """masses below this are drawn again (default 0.05)"""
+    kind: Annotated[str | None, flag(choices.KINDS, "normal")] = None
+    """distribution"""
+    strength: Annotated[float | None, flag("FLOAT", 0.3)] = None
+    """standard deviation xi, in mean masses"""
+    lower: Annotated[float | None, flag("FLOAT", 0.05)] = None
+    """masses below this are drawn again"""
 
 
 @dataclass(frozen=True)
 class ExcitationFlags:
     """How the chains are set in motion."""
 
-    kind: str | None = None
-    """standing_wave (default) or impulse"""
-    site: int | None = None
-    """impulse: particle, counted from 1 (default 1)"""
-    velocity: float | None = None
-    """impulse: initial velocity (default 0.01)"""
-    tones: tuple[int, ...] | None = None
-    """standing wave: tones, a run of its own each (default: the center tone of every band)"""
-    amplitude: float | None = None
-    """standing wave: amplitude in initial overlaps (default 0.01)"""
-    phase: str | None = None
-    """standing wave: sin (default) or cos"""
+    kind: Annotated[str | None, flag(choices.EXCITATIONS, "standing_wave")] = None
+    """a kick, or standing waves"""
+    site: Annotated[int | None, flag("INT", 1)] = None
+    """impulse: particle, counted from 1"""
+    velocity: Annotated[float | None, flag("FLOAT", 0.01)] = None
+    """impulse: initial velocity"""
+    tones: Annotated[tuple[int, ...] | None, flag("INT ...", "the center tone of every band")] = None
+    """standing waves: tones, a run of its own each"""
+    amplitude: Annotated[float | None, flag("FLOAT", 0.01)] = None
+    """standing waves: amplitude in initial overlaps"""
+    phase: Annotated[str | None, flag(("sin", "cos"), "sin")] = None
+    """standing waves: phase"""
 
 
 @dataclass(frozen=True)
 class TimesFlags:
     """Output times, in travel times of sound over one particle."""
 
-    start: float | None = None
-    """first time (default 0)"""
-    stop: float | None = None
-    """last time (default 50)"""
-    step: float | None = None
-    """step (default 0.25)"""
+    start: Annotated[float | None, flag("FLOAT", 0.0)] = None
+    """first time"""
+    stop: Annotated[float | None, flag("FLOAT", 50.0)] = None
+    """last time"""
+    step: Annotated[float | None, flag("FLOAT", 0.25)] = None
+    """step"""
 
 
 @dataclass(frozen=True)
 class SceneFlags:
     """Flags that describe a scene."""
 
-    config: str | None = None
+    config: Annotated[str | None, flag("FILE")] = None
     """scene file (TOML)"""
-    n_particles: int | None = None
-    """particles per chain (default 256)"""
-    boundary: str | None = None
-    """periodic (default) or fixed"""
+    n_particles: Annotated[int | None, flag("INT", 256)] = None
+    """particles per chain"""
+    boundary: Annotated[str | None, flag(choices.BOUNDARIES, "periodic")] = None
+    """ring, or chain between two walls"""
     disorder: DisorderFlags = field(default_factory=DisorderFlags)
     excitation: ExcitationFlags = field(default_factory=ExcitationFlags)
     times: TimesFlags = field(default_factory=TimesFlags)
-    n_bands: int | None = None
-    """wavenumber bands (default 32)"""
-    realizations: int | None = None
-    """chains in the ensemble (default 100)"""
-    seed: int | None = None
-    """seed of the ensemble (default 0)"""
-    tolerance: float | None = None
-    """accuracy wanted; none for the ensemble's own error"""
-    observables: tuple[str, ...] | None = None
-    """what to measure (default band_energy)"""
-    contact: str | None = None
-    """linear (default), hertz, or auto for linear where that is accurate enough"""
-    damping: float | None = None
-    """contact damping coefficient (default 0)"""
-    energy_definition: str | None = None
-    """site (default) or bond"""
-    opposite_pairs: bool | None = None
+    n_bands: Annotated[int | None, flag("INT", 32)] = None
+    """wavenumber bands"""
+    realizations: Annotated[int | None, flag("INT", 100)] = None
+    """chains in the ensemble"""
+    seed: Annotated[int | None, flag("INT", 0)] = None
+    """seed of the ensemble"""
+    tolerance: Annotated[float | None, flag("FLOAT", "the ensemble's own error")] = None
+    """accuracy wanted, relative to the observables' scale"""
+    observables: Annotated[tuple[str, ...] | None, flag("NAME ...", "band_energy", MEASURED)] = None
+    contact: Annotated[str | None, flag(choices.CONTACTS, "linear")] = None
+    """contact law; auto for linear where that is accurate enough"""
+    damping: Annotated[float | None, flag("FLOAT", 0.0)] = None
+    """contact damping coefficient"""
+    energy_definition: Annotated[str | None, flag(choices.DEFINITIONS, "site")] = None
+    """energy of a particle"""
+    opposite_pairs: Annotated[bool | None, flag(("True", "False"), False)] = None
     """draw chains in pairs of opposite masses: for means that change with the odd part of the disorder, such as widths"""
+    plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()
+    """registers observables, methods or models of its own; repeatable"""
 
     def overrides(self) -> dict[str, Any]:
-        """The flags that were given, as nested plain values."""
-        return _given(
-            self,
-            skip=(
-                "config", "out", "device", "method", "fit", "model", "window", "constraint", "penalty",
-                "bootstrap", "checkpoint_every", "threads", "artifact",
-            ),
-        )  # fmt: skip
+        """The flags of the scene that were given, as nested plain values."""
+        scene = {entry.name for entry in dataclasses.fields(SceneFlags)} - {"config", "plugin"}
+        return {name: value for name, value in given(self).items() if name in scene}
 
 
 @dataclass(frozen=True)
-class Simulate(SceneFlags):
+class RunFlags(SceneFlags):
+    """Flags of the commands that run an ensemble."""
+
+    out: Annotated[str, flag("FOLDER")] = "results"
+    device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
+    """cpu, cuda, cuda:1, ..."""
+    method: Annotated[str, flag(("auto", *choices.METHODS), "auto")] = "auto"
+    """how to evolve the chains; auto for the plan's choice"""
+    checkpoint_every: Annotated[float, flag("SECONDS", 5.0)] = 5.0
+    """seconds between saves of finished realizations in the folder, from which the same command goes on"""
+    threads: Annotated[int | None, flag("INT", "all cores, shared by the processes that torchrun starts")] = None
+    """threads of this process"""
+
+
+@dataclass(frozen=True)
+class Simulate(RunFlags):
     """Ensemble means of a scene's observables, with standard errors."""
 
-    out: str = "results/simulate"
-    """folder for config.toml, results.nc, figure.png and run.json"""
-    device: str = "cpu"
-    """cpu, cuda, cuda:1, ..."""
-    method: str = "auto"
-    """how to evolve the chains; auto for the plan's choice"""
-    checkpoint_every: float = 5.0
-    """seconds between saves of finished realizations in the folder, from which the same command goes on"""
-    threads: int | None = None
-    """threads of this process (default: all cores, shared by the processes that torchrun starts)"""
+    out: Annotated[str, flag("FOLDER", "results/simulate")] = "results/simulate"
+    """for config.toml, results.nc, figure.png and run.json"""
 
 
 @dataclass(frozen=True)
-class Calibrate(SceneFlags):
+class Calibrate(RunFlags):
     """A master equation from an ensemble: data, model file, figure and its error."""
 
-    out: str = "results/calibrate"
-    """folder for config.toml, transfer.nc, model.safetensors, figure.png and run.json"""
-    device: str = "cpu"
-    """cpu, cuda, cuda:1, ..."""
-    method: str = "auto"
-    """how to evolve the chains; auto for the plan's choice"""
-    fit: str | None = None
-    """analytic, linear, nonlinear, adam or projection (default: the best for the model)"""
-    model: str | None = None
-    """paper, exact_psi, basis_matrix, swing_in or memory (default: the smallest that reaches the ensemble's own error)"""
-    window: tuple[float, float] | None = None
-    """first and last time of the short-time fits (default 0.5 2)"""
-    constraint: str | None = None
-    """adam: exact (default) or penalty"""
-    penalty: float | None = None
-    """adam: weight of the conservation penalty (default 10)"""
-    bootstrap: int | None = None
-    """ensembles drawn again for the error bars, 0 for none (default 20, or none where fits take long)"""
-    checkpoint_every: float = 5.0
-    """seconds between saves of finished realizations in the folder, from which the same command goes on"""
-    threads: int | None = None
-    """threads of this process (default: all cores, shared by the processes that torchrun starts)"""
+    transfer: Annotated[str | None, flag("FILE|FOLDER")] = None
+    """calibrate on this transfer.nc, or the one in this folder, in place of a new ensemble"""
+    fit: Annotated[str | None, flag(choices.FITS, "the best for the model")] = None
+    """way to fit"""
+    model: Annotated[str | None, flag(choices.MODELS, "the smallest that reaches the ensemble's own error")] = None
+    """reduced model"""
+    window: Annotated[tuple[float, float] | None, flag("FIRST LAST", "0.5 2")] = None
+    """times of the short-time fits"""
+    constraint: Annotated[str | None, flag(("exact", "penalty"), "exact")] = None
+    """adam: how energy is conserved"""
+    penalty: Annotated[float | None, flag("FLOAT", 10.0)] = None
+    """adam: weight of the conservation penalty"""
+    bootstrap: Annotated[int | None, flag("INT", "20, or none where fits take long")] = None
+    """ensembles drawn again for the error bars, 0 for none"""
+    out: Annotated[str, flag("FOLDER", "results/calibrate")] = "results/calibrate"
+    """for config.toml, transfer.nc, model.safetensors, figure.png and run.json"""
 
     def calibration(self) -> dict[str, Any]:
         """The flags of the fit that were given."""
-        given = {name: getattr(self, name) for name in ("model", "window", "constraint", "penalty", "bootstrap")}
-        return {k: v for k, v in {"method": self.fit, **given}.items() if v is not None}
+        held = {"method": self.fit, **{name: getattr(self, name) for name in _FIT}}
+        return {name: value for name, value in held.items() if value is not None}
+
+
+_FIT = ("model", "window", "constraint", "penalty", "bootstrap")
 
 
 @dataclass(frozen=True)
 class Predict:
     """Band energies from a calibrated master equation."""
 
-    model: Annotated[str, tyro.conf.Positional]
-    """file written by calibrate, or by family"""
-    strength: float | None = None
+    model: Annotated[str, tyro.conf.Positional, flag("FILE|FOLDER")]
+    """file written by calibrate or family, or the folder that holds it"""
+    strength: Annotated[float | None, flag("FLOAT")] = None
     """disorder at which a family predicts"""
-    source: tuple[int, ...] | None = None
-    """bands that start with a unit energy, a run of its own each (default: every band)"""
-    initial: tuple[float, ...] | None = None
+    source: Annotated[tuple[int, ...] | None, flag("INT ...", "every band")] = None
+    """bands that start with a unit energy, a run of its own each"""
+    initial: Annotated[tuple[float, ...] | None, flag("FLOAT ...")] = None
     """energy of every band at the start, in place of --source"""
     times: TimesFlags = field(default_factory=TimesFlags)
-    method: str = "expm"
-    """expm or a torchdiffeq method"""
-    config: str | None = None
-    """file (TOML) with the same keys as the flags"""
-    seed: int | None = None
+    method: Annotated[str, flag(choices.SOLVERS, "expm")] = "expm"
+    """matrix exponential, or a method of torchdiffeq"""
+    config: Annotated[str | None, flag("FILE")] = None
+    """TOML with the same keys as the flags"""
+    seed: Annotated[int | None, flag("INT")] = None
     """recorded only: a prediction draws no random number"""
-    out: str = "results/predict"
-    """folder for config.toml, results.nc, figure.png and run.json"""
-    device: str = "cpu"
+    out: Annotated[str, flag("FOLDER", "results/predict")] = "results/predict"
+    """for config.toml, results.nc, figure.png and run.json"""
+    device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
     """cpu, cuda, cuda:1, ..."""
+    plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()
+    """registers models of its own; repeatable"""
 
     def overrides(self) -> dict[str, Any]:
-        """The flags that were given, as nested plain values."""
-        return _given(self, skip=("model", "config", "out", "device", "method", "seed"))
+        """The flags of the request that were given, as nested plain values."""
+        return {k: v for k, v in given(self).items() if k in ("strength", "source", "initial", "times")}
 
 
 @dataclass(frozen=True)
 class Family:
     """One model file for a range of disorder, from model files of calibrate at several strengths."""
 
-    models: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """files written by calibrate, with the model "memory" """
-    out: str = "results/family"
-    """folder for model.safetensors and run.json"""
+    models: Annotated[tuple[str, ...], tyro.conf.Positional, flag("FILE|FOLDER ...")]
+    """written by calibrate, with the model "memory" """
+    out: Annotated[str, flag("FOLDER", "results/family")] = "results/family"
+    """for model.safetensors and run.json"""
 
 
 @dataclass(frozen=True)
 class Plan(SceneFlags):
     """The cheapest way to meet a scene, with reasons and runners-up."""
 
-    artifact: str | None = None
+    artifact: Annotated[str | None, flag("FILE")] = None
     """a model file of calibrate that could take the place of the chains"""
 
 
@@ -194,27 +208,74 @@ class Plan(SceneFlags):
 class Rerun:
     """Make a run again from its record and compare: exit status 0 if all data are equal to the last bit, 1 if not."""
 
-    folder: Annotated[str, tyro.conf.Positional]
-    """folder left by simulate, calibrate or predict"""
-    out: str | None = None
-    """folder for the new run (default: compared, then discarded)"""
-    device: str | None = None
-    """cpu, cuda, ... (default: the recorded one)"""
-    threads: int | None = None
+    folder: Annotated[str, tyro.conf.Positional, flag("FOLDER")]
+    """left by simulate, calibrate or predict"""
+    out: Annotated[str | None, flag("FOLDER", "compared, then discarded")] = None
+    """for the new run"""
+    device: Annotated[str | None, flag("DEVICE", "the recorded one")] = None
+    """cpu, cuda, ..."""
+    threads: Annotated[int | None, flag("INT", "all cores")] = None
     """threads of this process"""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """How two results differ, in units of their standard errors: z-scores, total variation, settings, figure."""
+
+    a: Annotated[str, tyro.conf.Positional, flag("FILE|FOLDER")]
+    """results.nc or transfer.nc, or the folder of a run"""
+    b: Annotated[str, tyro.conf.Positional, flag("FILE|FOLDER")]
+    """the other"""
+    out: Annotated[str, flag("FOLDER", "results/compare")] = "results/compare"
+    """for figure.png and run.json"""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The same command at every combination of values of some fields; goes on where it was stopped."""
+
+    command: Annotated[str, tyro.conf.Positional, flag(("simulate", "calibrate"))]
+    """what to run"""
+    fields: Annotated[tuple[str, ...], tyro.conf.Positional, flag("FIELD=V1,V2 ...")]
+    """fields of the scene file and their values, as in disorder.strength=0.1,0.3 n_particles=128,256"""
+    config: Annotated[str | None, flag("FILE")] = None
+    """scene file (TOML) that holds all other fields"""
+    seed: Annotated[int | None, flag("INT", 0)] = None
+    """seed of every ensemble"""
+    out: Annotated[str, flag("FOLDER", "results/sweep")] = "results/sweep"
+    """for sweep.nc, sweep.csv, figure.png, run.json, and the folder of every run in runs"""
+    device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
+    """cpu, cuda, cuda:1, ..."""
+    threads: Annotated[int | None, flag("INT", "all cores, shared by the processes that torchrun starts")] = None
+    """threads of this process"""
+    plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()
+    """registers observables, methods or models of its own; repeatable"""
 
 
 COMMANDS: dict[str, Any] = {
     "simulate": Simulate, "calibrate": Calibrate, "predict": Predict, "family": Family, "plan": Plan, "rerun": Rerun,
+    "compare": Compare, "sweep": Sweep,
 }  # fmt: skip
 
 
-def _given(flags: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:
+def names(record: Any, prefix: str = "--") -> list[str]:
+    """The flags of a command, as they are written."""
+    found = []
+    for entry in dataclasses.fields(record):
+        name = prefix + entry.name.replace("_", "-")
+        kind = entry.default_factory
+        nested = dataclasses.is_dataclass(kind)
+        found += names(kind, f"{name}.") if nested else [name]
+    return found
+
+
+def given(flags: Any) -> dict[str, Any]:
+    """The flags that were given, as nested plain values."""
     plain: dict[str, Any] = {}
     for entry in dataclasses.fields(flags):
         value = getattr(flags, entry.name)
         if dataclasses.is_dataclass(value):
-            value = _given(value) or None
-        if value is not None and entry.name not in skip:
+            value = given(value) or None
+        if value is not None:
             plain[entry.name] = value
     return plain

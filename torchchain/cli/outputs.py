@@ -7,6 +7,7 @@ import json
 import math
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -16,19 +17,40 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-import xarray
 
 from torchchain import checks
+from torchchain.ensemble.ranks import rank_of_environment
+from torchchain.locks import lock
+from torchchain.progress import log
+
+if TYPE_CHECKING:
+    import xarray
 
 PACKAGES = ("torchchain", "torch", "numpy", "scipy", "torchdiffeq", "safetensors", "xarray", "h5netcdf", "matplotlib")
+COMPRESSION: dict[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True}
+RECORD = "run.json"
+"""Written last and removed first: where it is, all that it names is of one run."""
 Writer = Callable[[Path], None]
 
 
+@contextmanager
+def run_folder(out: str | Path) -> Iterator[Path]:
+    """The output folder, found writable before hours of work and held against other runs until this one ends."""
+    out = check_writable(out)
+    if rank_of_environment():  # the first process of a group holds it for all
+        yield out
+        return
+    with lock(out, "out"):
+        yield out
+
+
 def check_writable(out: str | Path) -> Path:
-    """The output folder's path; an error now, before hours of work, if nothing can be written there."""
+    """The output folder's path; an error now if nothing can be written there."""
+    if not str(out).strip():
+        raise checks.fail("out", "be a folder", repr(str(out)))
     out = Path(out)
     with _reported(out):
         if os.path.lexists(out) and not out.is_dir():
@@ -61,24 +83,28 @@ def _reported(out: Path) -> Iterator[None]:
 
 
 def write(out: str | Path, writers: dict[str, Writer]) -> None:
-    """Write all files beside the folder first, then move them in: a run that dies leaves nothing half-written.
+    """Write all files aside first, then move them in: a run that dies leaves nothing half-written.
 
     Args:
-        out: the folder, made with its parents; files of the same names in it are replaced.
+        out: the folder, made with its parents; files of the same names in it are replaced, the record last.
         writers: for each file name a function that writes to the path it is given.
     """
-    out = Path(out)
-    with _reported(out):
+    log.info("writing %s", out)
+    with _reported(Path(out)):
+        out = Path(out).absolute()
         out.parent.mkdir(parents=True, exist_ok=True)
-        for beside in list(out.parent.iterdir()):  # what killed runs left
-            if beside.name.startswith(f".{out.name}.") and beside.name.endswith(".part"):
-                shutil.rmtree(beside, ignore_errors=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
+        aside = (
+            out if out.exists() else out.parent
+        )  # a folder of the user's own may lie where nothing else can be written
+        _clear_staging(aside, out.name)
+        prefix = f".{out.name[:100]}.{os.getpid()}-"
+        staging = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=aside))
         try:
             for name, writer in writers.items():
                 writer(staging / name)
             staging.chmod(0o755)
             if out.exists():
+                (out / RECORD).unlink(missing_ok=True)
                 for name in writers:
                     os.replace(staging / name, out / name)
                 staging.rmdir()
@@ -87,6 +113,25 @@ def write(out: str | Path, writers: dict[str, Writer]) -> None:
         except BaseException:
             shutil.rmtree(staging, ignore_errors=True)
             raise
+
+
+def _clear_staging(folder: Path, name: str) -> None:
+    """Remove what killed runs into the folder of this name left: theirs to the letter, and of no living process."""
+    own = re.compile(re.escape(f".{name[:100]}.") + r"(\d+)-[a-z0-9_]{8}\.part")
+    for path in folder.iterdir():
+        found = own.fullmatch(path.name)
+        if found and not _is_alive(int(found[1])):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # of another user
+        pass
+    return True
 
 
 def text(content: str) -> Writer:
@@ -99,11 +144,12 @@ def text(content: str) -> Writer:
 
 
 def dataset(data: xarray.Dataset) -> Writer:
-    """A writer of a netCDF file."""
+    """A writer of a netCDF file; numbers are compressed without loss."""
 
     def writer(path: Path) -> None:
         _require_room(path, data.nbytes)
-        data.to_netcdf(path, engine="h5netcdf")
+        encoding = {name: COMPRESSION for name, values in data.data_vars.items() if values.ndim and values.dtype.kind in "fiu"}  # fmt: skip
+        data.to_netcdf(path, engine="h5netcdf", encoding=encoding)
 
     return writer
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray
 from safetensors.numpy import load_file
 
 from torchchain import checks
@@ -22,12 +21,14 @@ from torchchain.cli.flags import Calibrate, Predict, Rerun, Simulate
 from torchchain.cli.predict import run_predict
 from torchchain.cli.simulate import run_simulate
 from torchchain.ensemble import ranks
+from torchchain.results import read_dataset
 
 COMMANDS = ("simulate", "calibrate", "predict")
 DATA = {"simulate": ("results.nc",), "calibrate": ("transfer.nc", "model.safetensors"), "predict": ("results.nc",)}
 NEEDED = {"files": dict, "versions": dict, "device": str, "config_sha256": str}
 NEEDED_OF_PREDICT = {"method": str, "model.path": str, "model.sha256": str}
 NEEDED_OF_ENSEMBLE = {"resolved.method": str, "resolved.options": dict}
+NEEDED_OF_TRANSFER = {"transfer.path": str, "transfer.sha256": str}
 SAID_ELSEWHERE = ("torchchain_version",)  # attributes that the record's versions hold
 
 
@@ -76,7 +77,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     arguments = record.get("arguments") if isinstance(record, dict) else None
     if not isinstance(arguments, list) or not arguments or arguments[0] not in COMMANDS or "files" not in record:
         raise checks.fail(where, f"hold a run of {', '.join(COMMANDS)}", checks.shown(arguments))
-    needed = NEEDED | (NEEDED_OF_PREDICT if arguments[0] == "predict" else NEEDED_OF_ENSEMBLE)
+    source = NEEDED_OF_TRANSFER if "transfer" in record else NEEDED_OF_ENSEMBLE
+    needed = NEEDED | (NEEDED_OF_PREDICT if arguments[0] == "predict" else source)
     for name, kind in needed.items():
         held: Any = record
         for key in name.split("."):
@@ -107,11 +109,15 @@ def _again(record: Mapping[str, Any], folder: Path, out: Path, flags: Rerun) -> 
     device = flags.device or record["device"].partition(": ")[0]
     with contextlib.redirect_stdout(io.StringIO()):
         if record["arguments"][0] == "predict":
-            model = _model(record["model"])
+            model = _same_file("model", record["model"])
             request = Predict(
                 model=model, config=config, out=place, device=device, method=record["method"], seed=record["seed"]
             )
             run_predict(request, record["arguments"])
+            return
+        if "transfer" in record:
+            transfer = _same_file("transfer", record["transfer"])
+            run_calibrate(Calibrate(config=config, out=place, device=device, transfer=transfer), record["arguments"])
             return
         resolved, keep = record["resolved"], flags.out is not None
         how = {"config": config, "out": place, "device": device, "method": resolved["method"]}
@@ -121,14 +127,14 @@ def _again(record: Mapping[str, Any], folder: Path, out: Path, flags: Rerun) -> 
             run_calibrate(Calibrate(**how), record["arguments"], resolved["options"], keep)
 
 
-def _model(recorded: Mapping[str, str]) -> str:
-    """The model file of a prediction, checked to be the same."""
+def _same_file(name: str, recorded: Mapping[str, str]) -> str:
+    """The file that a run was given, checked to be the same."""
     path = Path(recorded["path"])
     if not path.is_file():
-        raise checks.fail("model", f"be where the run found it, with SHA-256 {recorded['sha256']}", f"no file {path}")
+        raise checks.fail(name, f"be where the run found it, with SHA-256 {recorded['sha256']}", f"no file {path}")
     found = outputs.sha256(path)
     if found != recorded["sha256"]:
-        raise checks.fail("model", f"have the SHA-256 {recorded['sha256']} of the run", f"{found} in {path}")
+        raise checks.fail(name, f"have the SHA-256 {recorded['sha256']} of the run", f"{found} in {path}")
     return str(path)
 
 
@@ -163,13 +169,12 @@ def difference(old: np.ndarray, new: np.ndarray) -> str:
 
 def _variables(path: Path) -> dict[str, np.ndarray]:
     """Everything that a file says, by name: variables, coordinates and attributes, or tensors."""
-    try:
-        if path.suffix == ".safetensors":
+    if path.suffix == ".safetensors":
+        try:
             return dict(load_file(path))
-        with xarray.open_dataset(path, engine="h5netcdf", decode_times=False) as file:
-            data = file.load()
-    except Exception as error:  # whatever the libraries say of a broken file
-        raise checks.fail(f"file {path}", "be a readable data file", checks.shown(str(error))) from None
+        except Exception as error:  # whatever the library says of a broken file
+            raise checks.fail(f"file {path}", "be a readable data file", checks.shown(str(error))) from None
+    data = read_dataset(path)
     plain = {str(name): np.asarray(values.values) for name, values in data.variables.items()}
     attributes = {f"attribute {name}": np.asarray(value) for name, value in data.attrs.items()}
     return plain | {name: value for name, value in attributes.items() if name.split()[-1] not in SAID_ELSEWHERE}
@@ -186,6 +191,8 @@ def notes(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> li
         old, new = (record["versions"].get(name, "none") for record in (before, now))
         if old != new:
             lines.append(f"{name} was {old}, is {new}")
+    changed = [name for name, digest in before.get("plugins", {}).items() if now.get("plugins", {}).get(name) != digest]
+    lines += [f"plugin {name} has changed since the run" for name in changed]
     for name in ("device", "machine", "git_revision"):
         if before.get(name) != now.get(name):
             lines.append(f"{name} was {before.get(name)}, is {now.get(name)}")

@@ -1,22 +1,29 @@
-"""What the commands that run an ensemble share: scene and folder from the flags, threads, what is kept of an interrupted run."""
+"""What the commands share: scene and folder from the flags, threads, plugins, what is kept of an interrupted run."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import tomli_w
 import torch
 
 from torchchain import checks
-from torchchain.cli import outputs
-from torchchain.cli.flags import Calibrate, SceneFlags, Simulate
+from torchchain.cli import outputs, plugins
+from torchchain.cli.flags import RunFlags, SceneFlags
+from torchchain.ensemble import plan as planning
 from torchchain.ensemble import ranks
 from torchchain.ensemble.checkpoint import Checkpoint, Interrupted
 from torchchain.ensemble.scene import Scene, read_toml
+from torchchain.ensemble.stages import Stages
 from torchchain.evolvers import METHODS
+
+Measured = TypeVar("Measured")
 
 
 @contextmanager
@@ -30,19 +37,95 @@ def threads_for(number: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@dataclass
+class Run:
+    """A command over an ensemble, from its start to its record.
+
+    Attributes:
+        flags, arguments: of the command.
+        out: its folder, held against other runs.
+        device: checked.
+        plugins: that were loaded.
+        options: of the method, where a record is followed.
+        checkpoint: None where nothing is to be kept.
+    """
+
+    flags: RunFlags
+    arguments: list[str]
+    out: Path
+    device: str
+    plugins: list[str]
+    options: dict[str, Any] | None
+    checkpoint: Checkpoint | None
+    stages: Stages = field(default_factory=Stages)
+    began: float = field(default_factory=time.time)
+    spent: float = 0.0
+    group: ranks.Ranks = ranks.ALONE
+
+    def measured(self, measure: Callable[..., Measured], scene: Scene) -> Measured | None:
+        """What :func:`simulate` or :func:`band_transfer` finds, on the first of the processes that share the work."""
+        with ranks.process_group(self.device) as self.group:
+            before = time.time()
+            found = measure(
+                scene, self.flags.method, device=self.device, progress=True, stages=self.stages, options=self.options,
+                checkpoint=self.checkpoint, ranks=self.group,
+            )  # fmt: skip
+            self.spent = time.time() - before
+        return None if self.group.rank else found
+
+    def how(self, attributes: Mapping[str, Any]) -> dict[str, Any]:
+        """What the record says of the ensemble: the method asked for and the one used, processes, what was taken over."""
+        return {
+            "method": self.flags.method,
+            "resolved": {"method": attributes["method"], "options": json.loads(attributes["method_options"])},
+            "processes": self.group.size,
+            "resumed_realizations": self.checkpoint.resumed if self.checkpoint is not None else 0,
+            "realized": {name: attributes[name] for name in ("mass_mean", "mass_sd")},
+        }
+
+    def config(self, *tables: str) -> str:
+        """The resolved config: the plugins, and the tables of the run."""
+        head = [tomli_w.dumps({"plugins": self.plugins})] if self.plugins else []
+        return "\n".join([*head, *tables])
+
+    def write(self, files: dict[str, outputs.Writer], config: str, **record: Any) -> None:
+        """Leave the files, the config and the record in the folder, and clear the checkpoint."""
+        hashes = {name: outputs.sha256(name) for name in self.plugins if name.endswith(".py")}
+        written = outputs.run_record(
+            self.arguments, config, self.device, self.began, self.stages.seconds,
+            **({"plugins": hashes} if self.plugins else {}), **record,
+        )  # fmt: skip
+        with self.stages("writing"):
+            outputs.write(self.out, {"config.toml": outputs.text(config), **files, outputs.RECORD: written})
+        if self.checkpoint is not None:
+            self.checkpoint.clear()
+
+    def told(self, forecast: Mapping[str, Any] | None) -> None:
+        """Print how long the ensemble took, and what it was expected to take."""
+        if forecast is not None:
+            print(planning.forecast_line(forecast))
+
+
 @contextmanager
-def keeping(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """An interrupt after the ensemble is done tells of the realizations that are kept."""
-    try:
-        yield
-    except Interrupted:
-        raise
-    except KeyboardInterrupt:
-        if checkpoint is None or not checkpoint.folder.exists():
+def running(
+    flags: RunFlags, arguments: list[str], loaded: list[str], options: dict[str, Any] | None, keep: bool
+) -> Iterator[Run]:
+    """A run whose flags are checked and whose folder is its own; an interrupt tells of what is kept."""
+    began = time.time()
+    device = str(checks.device("device", ranks.own_device(flags.device)))
+    checks.choice("method", flags.method, ("auto", *METHODS))
+    with outputs.run_folder(flags.out) as out:
+        checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
+        try:
+            yield Run(flags, arguments, out, device, loaded, options, checkpoint, began=began)
+        except Interrupted:
             raise
-        raise Interrupted(
-            f"interrupted: finished realizations are kept in {checkpoint.folder}, the same command goes on from there"
-        ) from None
+        except KeyboardInterrupt:
+            if checkpoint is None or not checkpoint.folder.exists():
+                raise
+            raise Interrupted(
+                f"interrupted: finished realizations are kept in {checkpoint.folder}, the same command goes on from there"
+            ) from None
 
 
 def merged_tables(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -59,32 +142,16 @@ def merged_tables(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str,
     return merged
 
 
-def scene_of(flags: SceneFlags, tables: tuple[str, ...] = ()) -> tuple[Scene, dict[str, Any]]:
-    """The scene of config file and flags, and the config's further tables."""
-    config = read_toml(flags.config) if flags.config is not None else {}
-    extra = {name: config.pop(name) for name in tables if name in config}
+def config_of(path: str | None, named: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """The config file without its list of plugins, and the plugins of file and flags, loaded."""
+    config = read_toml(path) if path is not None else {}
+    listed = plugins.of_config(config.pop("plugins", []))
+    return config, plugins.load(dict.fromkeys([*listed, *named]))
+
+
+def scene_of(config: dict[str, Any], flags: SceneFlags) -> Scene:
+    """The scene of config file and flags."""
     given = flags.overrides()
     if isinstance(given.get("times"), Mapping) and not isinstance(config.get("times"), Mapping):
-        config["times"] = {"start": 0.0, "stop": 50.0, "step": 0.25}
-    return Scene.from_dict(merged_tables(config, given)), extra
-
-
-def out_and_device(flags: Simulate | Calibrate) -> tuple[Path, str]:
-    """Folder and device of a run over an ensemble, and its method, checked before anything is computed."""
-    out = outputs.check_writable(flags.out)
-    device = str(checks.device("device", ranks.own_device(flags.device)))
-    checks.choice("method", flags.method, ("auto", *METHODS))
-    return out, device
-
-
-def how(
-    flags: Simulate | Calibrate, attributes: Mapping[str, Any], group: ranks.Ranks, checkpoint: Checkpoint | None
-) -> dict[str, Any]:
-    """What the record says of an ensemble: the method asked for and the one used, processes, what was taken over."""
-    return {
-        "method": flags.method,
-        "resolved": {"method": attributes["method"], "options": json.loads(attributes["method_options"])},
-        "processes": group.size,
-        "resumed_realizations": checkpoint.resumed if checkpoint is not None else 0,
-        "realized": {name: attributes[name] for name in ("mass_mean", "mass_sd")},
-    }
+        config = {**config, "times": {"start": 0.0, "stop": 50.0, "step": 0.25}}
+    return Scene.from_dict(merged_tables(config, given))

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
-import xarray
+from typing import TYPE_CHECKING, Any
 
 from torchchain import plots
 from torchchain.cli import outputs
 from torchchain.cli.flags import Simulate
-from torchchain.cli.runs import how, keeping, out_and_device, scene_of
+from torchchain.cli.runs import Run, config_of, running, scene_of
 from torchchain.ensemble import plan as planning
-from torchchain.ensemble import ranks
-from torchchain.ensemble.checkpoint import Checkpoint
 from torchchain.ensemble.scene import Scene, describe
 from torchchain.ensemble.simulation import simulate
-from torchchain.ensemble.stages import Stages
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def run_simulate(
@@ -31,47 +28,22 @@ def run_simulate(
         options: of the method.
         keep: whether to keep a checkpoint in the folder until it is done.
     """
-    began = time.time()
-    scene = planning.resolved(scene_of(flags)[0])
-    out, device = out_and_device(flags)
-    checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
-    with keeping(checkpoint):
-        _simulate(flags, scene, out, device, arguments, options, checkpoint, began)
+    config, loaded = config_of(flags.config, flags.plugin)
+    scene = planning.resolved(scene_of(config, flags))
+    with running(flags, arguments, loaded, options, keep) as run:
+        data = run.measured(simulate, scene)
+        if data is not None:
+            _leave(run, scene, data)
 
 
-def _simulate(
-    flags: Simulate, scene: Scene, out: Path, device: str, arguments: list[str], options: dict[str, Any] | None,
-    checkpoint: Checkpoint | None, began: float,
-) -> None:  # fmt: skip
-    stages = Stages()
-    with ranks.process_group(device) as group:
-        before = time.time()
-        data = simulate(
-            scene, flags.method, device=device, progress=True, stages=stages, options=options, checkpoint=checkpoint,
-            ranks=group,
-        )  # fmt: skip
-        spent = time.time() - before
-    if group.rank:
-        return
-    forecast = planning.forecast(scene, data.attrs, spent, _largest_error(data, scene.observables))
-    figure = _simulate_figure(scene, data)
-    config = scene.to_toml()
-    outputs.write(
-        out,
-        {
-            "config.toml": outputs.text(config),
-            "results.nc": outputs.dataset(data),
-            "figure.png": outputs.figure(figure),
-            "run.json": outputs.run_record(
-                arguments, config, device, began, stages.seconds, seed=scene.seed, forecast=forecast,
-                **how(flags, data.attrs, group, checkpoint),
-            ),
-        },
-    )  # fmt: skip
-    if checkpoint is not None:
-        checkpoint.clear()
+def _leave(run: Run, scene: Scene, data: xarray.Dataset) -> None:
+    forecast = planning.forecast(scene, data.attrs, run.spent, _largest_error(data, scene.observables))
+    with run.stages("figure"):
+        figure = _figure(scene, data)
+    files = {"results.nc": outputs.dataset(data), "figure.png": outputs.figure(figure)}
+    run.write(files, run.config(scene.to_toml()), seed=scene.seed, forecast=forecast, **run.how(data.attrs))
     print(describe(scene))
-    print(planning.forecast_line(forecast))
+    run.told(forecast)
     print(f"masses: mean {data.attrs['mass_mean']:.6f}, standard deviation {data.attrs['mass_sd']:.6f}")
     for name in scene.observables:
         last = data[name].isel(time=-1) if "time" in data[name].dims else data[name]
@@ -79,7 +51,7 @@ def _simulate(
         error = error.isel(time=-1) if "time" in error.dims else error
         if last.ndim == 0:
             print(f"{name} at the last time: {float(last):.6g} +- {float(error):.2g}")
-    print(f"{time.time() - began:.1f} s, results in {out}")
+    print(f"{time.time() - run.began:.1f} s, results in {run.flags.out}")
 
 
 def _largest_error(data: xarray.Dataset, names: Sequence[str]) -> float:
@@ -87,28 +59,35 @@ def _largest_error(data: xarray.Dataset, names: Sequence[str]) -> float:
     return max(float(data[f"{name}_stderr"].max()) / (float(abs(data[name]).max()) or 1.0) for name in names)
 
 
-def _simulate_figure(scene: Scene, data: xarray.Dataset) -> Any:
+def _figure(scene: Scene, data: xarray.Dataset) -> Any:
     names = list(scene.observables)
     figure, axes = plots.figure(6, 3.6 * len(names), len(names), 1)
     times = scene.times.numpy()
     for ax, name in zip(axes[:, 0], names, strict=True):
-        values = data[name]
-        first = values.isel(tone=len(scene.tones) // 2) if "tone" in values.dims else values
+        values, error = data[name], data[f"{name}_stderr"]
+        chosen = ""
+        if "tone" in values.dims:
+            values, error = (part.isel(tone=len(scene.tones) // 2) for part in (values, error))
+            chosen = f"tone {int(values.tone)}"
         label = f"{values.attrs['long_name']} ({values.attrs['units']})"
-        chosen = f"tone {int(first.tone)}" if "tone" in values.dims else ""
         if name == "band_energy":
-            plots.band_map(ax, times, first.values, title=chosen)
-        elif first.ndim == 2:
-            axis = first.dims[1]
+            plots.band_map(ax, times, values.values, title=chosen)
+        elif values.ndim == 2:
+            axis = values.dims[1]
             plots.field_map(
-                ax, times, data[axis].values, first.values, plots.TIME_LABEL, data[axis].attrs.get("long_name", str(axis)),
-                label, chosen, signed=name == "displacement",
+                ax, times, data[axis].values, values.values, plots.TIME_LABEL, _label(data, axis), label, chosen,
+                signed=name == "displacement",
             )  # fmt: skip
+        elif values.ndim == 1:
+            axis = values.dims[0]
+            plots.curve(ax, data[axis].values, values.values, error.values)
+            ax.set(xlabel=_label(data, axis), ylabel=label, title=chosen)
         else:
-            axis = first.dims[0]
-            error = data[f"{name}_stderr"]
-            error = error.isel(tone=len(scene.tones) // 2) if "tone" in error.dims else error
-            plots.curve(ax, data[axis].values, first.values, error.values)
-            ax.set(xlabel=data[axis].attrs.get("long_name", str(axis)), ylabel=label, title=chosen)
+            ax.set_axis_off()
+            ax.text(0.5, 0.5, f"{label}: axes {', '.join(map(str, values.dims))}", ha="center")
     figure.suptitle(describe(scene), fontsize="small")
     return figure
+
+
+def _label(data: xarray.Dataset, axis: Any) -> str:
+    return str(data[axis].attrs.get("long_name", axis))

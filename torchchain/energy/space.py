@@ -18,18 +18,11 @@ def checked(chain: Chain, trajectory: Trajectory) -> None:
     """An error unless these are a chain and a trajectory with its particles."""
     checks.instance("chain", chain, Chain)
     checks.instance("trajectory", trajectory, Trajectory)
-    n, shape = chain.n_particles, getattr(trajectory.displacement, "shape", ())
-    for field in ("displacement", "velocity"):
-        value = getattr(trajectory, field)
-        checks.instance(f"trajectory.{field}", value, Tensor)
-        if value.dtype not in (torch.float32, torch.float64) or value.layout != torch.strided or value.is_meta:
-            raise checks.FieldTypeError(
-                f"trajectory.{field} must be a dense tensor of float32 or float64, got {value.dtype} on {value.device}"
-            )
-        if value.ndim < 2 or value.shape[-1] != n or value.shape != shape:
-            raise checks.fail(
-                f"trajectory.{field}", f"have shape (*batch, time, {n}), one for both", f"shape {tuple(value.shape)}"
-            )
+    shape = tuple(trajectory.displacement.shape)
+    if shape[-1] != chain.n_particles:
+        raise checks.fail(
+            "trajectory.displacement", f"have shape (*batch, time, {chain.n_particles}) as the chain", f"shape {shape}"
+        )
 
 
 def kinetic_energy(chain: Chain, trajectory: Trajectory) -> Tensor:
@@ -47,23 +40,21 @@ def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "si
     Args:
         chain: the chain of the trajectory.
         trajectory: displacement (*batch, time, particle).
-        definition: "site" is -F u / 2 (Eq. 33), negative on many sites of a disordered chain; "bond" is half of
-            the energy of both contacts (Eq. A3), never negative, and counts the whole of a wall contact for its
-            one particle. Both have the same sum for linear contacts. Hertz contacts have only "bond".
+        definition: "site" is -F u / 2 (Eq. 33), negative on many sites of a disordered chain; on a ring u is counted
+            from where its rigid motion has taken it, as the particle energies would otherwise grow with that. "bond" is
+            half of the energy of both contacts (Eq. A3), never negative, and counts the whole of a wall contact for
+            its one particle. Both have the same sum for linear contacts. Hertz contacts have only "bond".
     """
     checked(chain, trajectory)
     checks.choice("definition", definition, DEFINITIONS)
     displacement = trajectory.displacement
     if definition == "site":
         require_linear(chain, "definition 'bond'")
-        return checks.finite("energy of trajectory", -chain.force(displacement) * displacement / 2, "particle")
-    contact = checks.finite("energy of trajectory", chain.contact_energy(displacement) / 2, "contact")
-    if chain.boundary == "periodic":
-        return contact + contact.roll(-1, -1)
-    energy = contact[..., 1:] + contact[..., :-1]
-    energy[..., 0] += contact[..., 0]
-    energy[..., -1] += contact[..., -1]
-    return energy
+        energy = chain.force(displacement) * (displacement - chain.rigid_displacement(displacement)) / -2
+        return checks.finite("energy of trajectory", energy, "particle")
+    contact = checks.finite("energy of trajectory", chain.contact_energy(displacement), "contact")
+    ends = chain.of_both_ends(torch.ones_like(displacement[..., 0, :]))[..., None, :]  # a wall's contact has one
+    return chain.of_both_contacts(contact / ends)
 
 
 def particle_energy(chain: Chain, trajectory: Trajectory, definition: str = "site") -> Tensor:
@@ -73,8 +64,8 @@ def particle_energy(chain: Chain, trajectory: Trajectory, definition: str = "sit
 
 def total_energy(chain: Chain, trajectory: Trajectory) -> Tensor:
     """Energy of the whole chain relative to the precompressed state (Eq. 41), (*batch, time)."""
-    total = kinetic_energy(chain, trajectory).sum(-1) + chain.contact_energy(trajectory.displacement).sum(-1)
-    return checks.finite("energy of trajectory", total, "time")
+    checked(chain, trajectory)
+    return checks.finite("energy of trajectory", chain.energy(trajectory.displacement, trajectory.velocity), "time")
 
 
 def require_linear(chain: Chain, remedy: str) -> None:
@@ -95,7 +86,7 @@ class EnergyMatrices:
 
 
 def energy_matrices(chain: Chain, trajectory: Trajectory) -> EnergyMatrices:
-    """The full energy matrices M v v^T / 2 and -K u u^T / 2; their diagonals are the site energies.
+    """The full energy matrices M v v^T / 2 and -K u u^T / 2, a ring's u without its rigid motion; site energies on the diagonal.
 
     N times the memory of the diagonal, which is all that the rest of the library uses: for looking at the
     correlations between particles.
@@ -103,6 +94,7 @@ def energy_matrices(chain: Chain, trajectory: Trajectory) -> EnergyMatrices:
     checked(chain, trajectory)
     require_linear(chain, "total_energy or particle_energy with definition 'bond'")
     displacement, velocity = trajectory.displacement, trajectory.velocity
+    displacement = displacement - chain.rigid_displacement(displacement)
     masses = chain.align(chain.masses, velocity)
     kinetic = torch.einsum("...p,...q->...pq", masses * velocity, velocity) / 2
     potential = torch.einsum("...p,...q->...pq", chain.force(displacement), displacement) / -2

@@ -43,6 +43,7 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
             wave = _transform(displacement)
             bound = strain * _product(wave, wave)
         else:
+            displacement = displacement - chain.rigid_displacement(displacement)
             bound = -_product(_transform(chain.force(displacement)), _transform(displacement))
         energy = (moving + bound) / 2
     else:
@@ -57,7 +58,7 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
 
 
 def _require_ring(chain: Chain) -> None:
-    if chain.boundary == "fixed":  # N + 1 contacts on N wavenumbers: a transform of their own length would not fit
+    if not chain.is_free:  # N + 1 contacts on N wavenumbers: a transform of their own length would not fit
         raise checks.fail("boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary))
 
 
@@ -137,8 +138,8 @@ def long_time_band_energy(
 
     A mode of energy E_j, half kinetic and half potential on average, contributes E_j Re[(M s_j)^ conj(s_j^)]
     at each wavenumber (^: unitary DFT), since -K s_j = w_j^2 M s_j, and for "bond" E_j / 2 times the squares of
-    (sqrt(b) s_j)^ and of (sqrt(kappa) times its elongations)^ / w_j. Two modes of equal frequency, as the ordered
-    ring has, beat at no frequency and contribute their cross term.
+    (sqrt(b) s_j)^ and of (sqrt(kappa) times its elongations)^ / w_j. Modes of equal frequency, as the ordered ring
+    or equal light beads far apart have, beat at no frequency and contribute their cross terms.
 
     Args:
         chain: linear contacts, undamped, an even number of particles.
@@ -164,16 +165,18 @@ def long_time_band_energy(
     energy = (swing.square() + velocity.square()) / 2
     pairs = _mode_transforms(chain, modes, definition)
     bands = change_basis(energy, _mean_weight(pairs, n_bands))
-    # Cross terms of neighboring modes of one frequency; a chain has at most two modes of one frequency.
-    gap = modes.frequencies.diff(dim=-1)
-    equal = gap <= 64 * torch.finfo(gap.dtype).eps * modes.frequencies[..., -1:]
-    if bool(equal.any()):
-        cross = swing[..., 1:] * swing[..., :-1] + velocity[..., 1:] * velocity[..., :-1]
+    # Cross terms of modes of one frequency, those with the next mode, with the next but one, ... while there are any.
+    step = modes.frequencies.diff(dim=-1)
+    beside = step <= 64 * torch.finfo(step.dtype).eps * modes.frequencies[..., -1:]
+    equal, d = beside, 1
+    while checks.first(equal) is not None:
+        cross = swing[..., d:] * swing[..., :-d] + velocity[..., d:] * velocity[..., :-d]
         cross = torch.where(chain.align(equal, cross), cross, torch.zeros_like(cross))
-        upper = [(left[..., 1:, :], right[..., :-1, :]) for left, right in pairs]
-        lower = [(left[..., :-1, :], right[..., 1:, :]) for left, right in pairs]
+        upper = [(left[..., d:, :], right[..., :-d, :]) for left, right in pairs]
+        lower = [(left[..., :-d, :], right[..., d:, :]) for left, right in pairs]
         weight = _mean_weight(upper, n_bands) + _mean_weight(lower, n_bands)
         bands = bands + change_basis(cross, weight) / 2
+        equal, d = equal[..., :-1] & beside[..., d:], d + 1
     if not normalize:
         return bands
     total = energy.sum(-1, keepdim=True)
@@ -188,7 +191,7 @@ def _mode_transforms(chain: Chain, modes: NormalModes, definition: str) -> list[
         return [(_transform(chain.masses[..., None, :] * shapes), _transform(shapes))]
     _require_ring(chain)
     moved = _transform(chain.masses.sqrt()[..., None, :] * shapes)
-    stretched = _transform(chain.contact_stiffness.sqrt()[..., None, :] * (shapes - shapes.roll(1, -1)))
+    stretched = _transform(chain.contact_stiffness.sqrt()[..., None, :] * chain.elongation(shapes))
     still = modes.frequencies[..., None] == 0  # the zero mode has kinetic energy alone
     stretched = torch.where(still, moved, stretched / modes.frequencies[..., None].masked_fill(still, 1))
     return [(moved, moved), (stretched, stretched)]

@@ -25,6 +25,17 @@ class PartExceeded(Exception):
     """A wave has come to the end of the part that it was expected to stay in."""
 
 
+@dataclass(frozen=True, eq=False)
+class PartOfChain(Chain):
+    """The part of a chain that moves, between walls where it was cut; a ring's moves as a whole as the ring does."""
+
+    whole_rigid_mass: Tensor | None = None
+
+    @property
+    def rigid_mass(self) -> Tensor:
+        return super().rigid_mass if self.whole_rigid_mass is None else self.whole_rigid_mass
+
+
 @dataclass(frozen=True)
 class MovingPart:
     """Particles first, ..., last - 1 of a chain of n_particles, counted from 0: all that move by the last time."""
@@ -40,12 +51,13 @@ class MovingPart:
     def chain(self, chain: Chain) -> Chain:
         """The part as a chain of its own, between walls where it was cut: particles beyond stay at rest."""
         inner, contacts = slice(self.first, self.last), slice(self.first, self.last + 1)
-        return Chain(
+        return PartOfChain(
             chain.masses[..., inner],
             "fixed",
             chain.contact_stiffness[..., contacts],
             chain.contact,
             chain.contact_damping[..., contacts],
+            whole_rigid_mass=chain.rigid_mass,
         )
 
     def state(self, state: State) -> State:

@@ -6,7 +6,7 @@ With A = -M^-1 K, a squared frequency W^2 that no mode exceeds, x = 1 - 2 A / W^
 
 (Tal-Ezer, SIAM J. Numer. Anal. 23, 11, 1986; Kosloff et al., Geophys. Prospecting 37, 383, 1989): a polynomial in A
 of a degree that is z / 2 and a few more. A start (u, v) needs it, its time integral and its time derivative, which
-are sums over the same T_k; :func:`coefficients` has theirs. No matrix is formed.
+are sums over the same T_k; :mod:`coefficients` has theirs. No matrix is formed.
 
 The times are crossed in *segments*; see :data:`LEAP`. The sums leave out coefficients that add up to no more than
 accuracy / 1024, or half an ulp where that is larger, in each segment. As |T_k(x)| <= 1 on the spectrum, what is left
@@ -21,6 +21,7 @@ kernels of :mod:`stencil` do the same.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -31,9 +32,11 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
-from torchchain.evolvers.expansion import LEAP, ROUNDING, SEGMENTS, coefficients
+from torchchain.evolvers import kernels
+from torchchain.evolvers.expansion import LEAP, ROUNDING, SEGMENTS
 from torchchain.evolvers.method import Advance, Method
 from torchchain.modes import phase
+from torchchain.modes.localization import negative_pivots
 
 if TYPE_CHECKING:
     from torchchain.evolvers.stencil import March, Rows
@@ -80,6 +83,7 @@ def _compilable(chain: Chain, state: State) -> bool:
         x.device.type == "cpu"
         and x.dtype in (torch.float32, torch.float64)
         and not (x.requires_grad and torch.is_grad_enabled())
+        and not checks.is_transformed(x)
         for x in tensors
     )
 
@@ -98,7 +102,9 @@ def highest_frequency(chain: Chain, bound: float | Tensor | None = None) -> Tens
         squared = (
             chain.squared_frequency_bound(SWEEPS).to(torch.float64) if bound is None else _checked_bound(chain, bound)
         )
-        return torch.as_tensor(_rounded_up(squared.sqrt().cpu().numpy()), device=squared.device)
+        if checks.is_transformed(squared):  # one bound for all that vmap runs at once
+            squared = checks.traced_values(squared).amax().expand(chain.batch_shape)
+        return torch.as_tensor(_rounded_up(checks.traced_values(squared.sqrt().cpu()).numpy()), device=squared.device)
 
 
 def _rounded_up(frequency: np.ndarray) -> np.ndarray:
@@ -116,11 +122,13 @@ def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
             "bound", f"be a number or have shape {tuple(chain.batch_shape)}", f"shape {tuple(squared.shape)}"
         )
     squared = squared.expand(chain.batch_shape)
+    double = replace(chain, masses=chain.masses.double())
     checks.first_bad(
         "bound",
         "not lie below the largest squared frequency (chain.squared_frequency_bound() never does)",
         squared,
-        _exceeded(chain, squared),
+        # A margin for rounding; no single high mode escapes a count of all of them.
+        negative_pivots(double, (squared * (1 + 1e-12))[..., None])[..., 0] < chain.n_particles,
         "chain",
     )
     own = WASTE * chain.squared_frequency_bound(SWEEPS).to(torch.float64)
@@ -129,34 +137,11 @@ def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
     return squared
 
 
-def _exceeded(chain: Chain, squared: Tensor) -> Tensor:
-    """Whether a squared frequency of each chain exceeds the bound by more than rounding, (*batch,).
+def kernels_compiled() -> bool:
+    """Whether the kernels need no compiling, in this process or from Numba's cache; the answer takes loading Numba."""
+    from torchchain.evolvers.stencil import march
 
-    No eigenvalue of A exceeds the bound exactly where bound M + K is positive semidefinite, and by Sylvester's law of
-    inertia that is where elimination finds no negative pivot: a test that no single high mode escapes.
-    """
-    n = chain.n_particles
-    masses = chain.masses.double().reshape(-1, n).cpu().numpy().T
-    stiffness = chain.contact_stiffness.double().reshape(-1, chain.n_contacts).cpu().numpy().T
-    right = np.roll(stiffness, -1, axis=0) if chain.boundary == "periodic" else stiffness[1:]
-    diagonal = squared.reshape(-1).cpu().numpy() * (1 + 1e-12) * masses - stiffness[:n] - right
-    # On a ring the last particle is coupled to the first, too, and by elimination to each of the others in turn.
-    corner = stiffness[0] if chain.boundary == "periodic" else np.zeros_like(stiffness[0])
-    exceeded = np.zeros(corner.shape, bool)
-    last = diagonal[-1]
-    pivot = diagonal[0]
-    for p in range(n - 1):
-        exceeded |= pivot <= 0
-        pivot = np.where(exceeded, 1.0, pivot)
-        coupling = right[p]
-        if p == n - 2:
-            last = last - (corner + coupling) ** 2 / pivot
-        else:
-            last = last - corner**2 / pivot
-            corner = -corner * coupling / pivot
-            pivot = diagonal[p + 1] - coupling**2 / pivot
-    exceeded |= last < 0
-    return torch.from_numpy(exceeded).reshape(squared.shape).to(squared.device)
+    return kernels.at_hand(march)
 
 
 def check_work(times: Tensor, frequency: float) -> None:
@@ -173,15 +158,17 @@ def check_work(times: Tensor, frequency: float) -> None:
 
 def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> Advance:
     """The expansion in plain torch, from each output time to the next."""
+    from torchchain.evolvers.coefficients import coefficients_of  # imports Numba
+
     axis = len(chain.batch_shape)
     pair = torch.stack([state.displacement, state.velocity], dim=axis)
     ahead = (None,) * (pair.ndim - axis - 1)  # axes of a state behind the batch
-    frequencies = frequency.reshape(-1).cpu().numpy()
+    frequencies = checks.traced_values(frequency.reshape(-1).cpu()).numpy()
     weight = chain.align((4 / frequency.square()).to(chain.masses)[..., None] / chain.masses, pair)
     now = 0.0
 
     def step(pair: Tensor, time: np.ndarray) -> Tensor:
-        table = torch.from_numpy(coefficients(frequencies, time, tolerance)).to(pair)
+        table = torch.from_numpy(coefficients_of(frequencies, time, tolerance)).to(pair)
         table = table.reshape(*table.shape[:2], *chain.batch_shape)[(..., *ahead)]
         older, old = pair, pair + weight / 2 * chain.force(pair)
         total: list[Tensor] = []
@@ -219,7 +206,7 @@ def _later(times: Tensor, now: float) -> Tensor:
     """The times as float64 on the CPU, none before those of the last window."""
     if bool(times[0] < now):
         raise checks.fail("times", f"not go back behind the last window's end {now:g}", times[0].item())
-    return times.detach().to("cpu", torch.float64)
+    return checks.traced_values(times.detach().to("cpu", torch.float64))
 
 
 class CompiledAdvance:
@@ -233,12 +220,9 @@ class CompiledAdvance:
         def plain(x: Tensor) -> np.ndarray:
             return x.detach().double().reshape(-1, x.shape[-1]).contiguous().numpy()
 
-        contacts = chain.contact_stiffness
-        if chain.boundary == "periodic":
-            contacts = torch.cat([contacts, contacts[..., :1]], dim=-1)
-        masses, springs = plain(chain.masses), plain(contacts)
+        masses, springs = plain(chain.masses), plain(chain.in_a_row(chain.contact_stiffness))
         states = torch.stack([state.displacement.detach(), state.velocity.detach()], dim=-2)
-        periodic = chain.boundary == "periodic"
+        periodic = chain.is_free
         squared = np.empty(len(masses))
         if bound is None:
             stencil.share(
@@ -250,6 +234,7 @@ class CompiledAdvance:
         self.rows: Rows = stencil.Rows(
             masses=masses,
             contacts=springs,
+            rigid_masses=plain(chain.rigid_mass[..., None])[:, 0],
             frequencies=_rounded_up(np.sqrt(squared)),
             states=states.double().reshape(-1, 2, n).numpy(),
             starts=math.prod(state.displacement.shape[:-1]) // len(masses),

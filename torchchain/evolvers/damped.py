@@ -43,7 +43,7 @@ def generator(frequencies: Tensor, damping: Tensor) -> Tensor:
 def start(chain: Chain, state: State) -> Advance:
     """See the registry entry below."""
     modes = normal_modes(replace(chain, damping=0.0))
-    rigid = int(chain.boundary == "periodic")
+    rigid = int(chain.is_free)
     shapes, w = modes.shapes[..., rigid:], modes.frequencies[..., rigid:]
     rate = chain.elongation(shapes.mT)
     matrix = generator(w, rate @ (chain.contact_damping[..., :, None] * rate.mT))

@@ -11,13 +11,13 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numba
 import numpy as np
 
-_compile = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+from torchchain.evolvers import kernels
+from torchchain.evolvers.compiling import kernel, summing_kernel
 
 
-@_compile
+@kernel
 def _wrap(field, periodic):
     n = field.shape[0] - 2
     if periodic:
@@ -25,14 +25,14 @@ def _wrap(field, periodic):
         field[n + 1] = field[1]
 
 
-@_compile
+@kernel
 def _drift(displacement, velocity, duration, periodic):
     for i in range(displacement.shape[0]):
         displacement[i] += duration * velocity[i]
     _wrap(displacement, periodic)
 
 
-@_compile
+@kernel
 def _kick(displacement, velocity, duration, weight, stiffness, hertz, tension, peak, periodic):
     n = weight.shape[0]
     if hertz:
@@ -60,7 +60,7 @@ def _kick(displacement, velocity, duration, weight, stiffness, hertz, tension, p
     _wrap(velocity, periodic)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@summing_kernel
 def _damp(displacement, velocity, duration, weight, damping, hertz, active, force, middle, periodic):
     """Contact damping over the duration by the explicit midpoint rule; returns the kinetic energy it takes."""
     n = weight.shape[0]
@@ -90,7 +90,7 @@ def _damp(displacement, velocity, duration, weight, damping, hertz, active, forc
     return -work
 
 
-@_compile
+@kernel
 def _advance_row(
     displacement, velocity, peak, lost, weight, stiffness, damping, periodic, hertz, damped,
     opening, middle, closing, substeps, steps, displacements, velocities, losses, openings,
@@ -146,7 +146,7 @@ def _advance_row(
     return lost
 
 
-@_compile
+@kernel
 def _advance_rows(
     begin, end, displacement, velocity, peak, lost, weight, stiffness, damping, periodic, hertz, damped,
     opening, middle, closing, substeps, steps, displacements, velocities, losses, openings,
@@ -172,6 +172,7 @@ def advance_rows(threads: int, *arguments: Any) -> None:
             opening (2,), middle (stage, 2) and closing (2,) drifts and kicks; substeps and their length (row, time);
             the outputs displacement and velocity (row, time, particle), energy lost and openings (row, time).
     """
+    kernels.announce(_advance_rows)
     rows = len(arguments[0])
     threads = min(threads, rows)
     if threads <= 1:

@@ -41,6 +41,18 @@ class AdamSettings:
         checks.number("tolerance", self.tolerance, at_least=0, below=1)
 
 
+@dataclass(frozen=True)
+class AdamReport:
+    """How the search went: whether the loss, a mean squared misfit, settled, its first and smallest value, the constraint."""
+
+    converged: bool
+    steps: int
+    loss: float
+    first_loss: float
+    constraint: str
+    penalty: float
+
+
 class ConstrainedRates(nn.Module):
     """Q with no negative rate between bands and rows that sum to zero, whatever its parameter."""
 
@@ -77,7 +89,7 @@ def fit_rates(
     settings: AdamSettings,
     progress: Any = None,
     delay: Tensor | None = None,
-) -> tuple[Tensor, Tensor | None, dict[str, Any]]:
+) -> tuple[Tensor, Tensor | None, AdamReport]:
     """Minimize the squared difference between Pi + (I - Pi) exp(Q t) and the ensemble over all times.
 
     Deterministic: it starts from ``initial`` and draws no random number.
@@ -92,7 +104,7 @@ def fit_rates(
         delay: tau of :class:`SwingInModel` to start from, fitted too; None for rates that act at once.
 
     Returns:
-        Q [source, receiver] and tau of the smallest loss, and a report: converged, steps, loss, penalty.
+        Q [source, receiver] and tau of the smallest loss, and a report.
     """
     rest = torch.eye(len(basis), dtype=basis.dtype) - basis
     module: nn.Module = (ConstrainedRates if settings.constraint == "exact" else FreeRates)(initial)
@@ -132,4 +144,5 @@ def fit_rates(
         if len(losses) > 100 and min(losses[:-50]) - best < settings.tolerance * best:
             converged = True
             break
-    return best_rates, best_delay, {"converged": converged, "steps": len(losses), "loss": best, "first_loss": losses[0]}
+    report = AdamReport(converged, len(losses), best, losses[0], settings.constraint, settings.penalty)
+    return best_rates, best_delay, report

@@ -2,77 +2,87 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
-from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master import trust
-from torchchain.master.adam import AdamSettings
-from torchchain.master.equation import Calibration, MasterEquation
+from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import FitWarning, checked_window, within
-from torchchain.master.ladder import BASES, MODELS, Recipe, Sample, exact_basis, fit
-from torchchain.master.memory import LADDER, checked_order
-from torchchain.master.model import RateModel, TransferModel
+from torchchain.master.ladder import MODELS, fitted_by, methods
+from torchchain.master.model import TransferModel
+from torchchain.master.rates import RateModel
+from torchchain.master.records import Fit, NoSettings, Recipe, ReducedModel
+from torchchain.master.report import Calibration, Report
+from torchchain.master.sample import Sample, loss_of
+from torchchain.master.selection import select
+from torchchain.master.uncertainty import draw_again, horizon
+from torchchain.progress import bar
 
 LINEAR_WINDOW = (0.5, 2.0)
-NONLINEAR_WINDOW = (0.5, 4.5)
-METHODS = ("analytic", "linear", "nonlinear", "adam", "projection")
-"""Ways to fit: four for rates Q, and variable projection for the model "memory"."""
 REPLICATES = 20
 """Of the bootstrap, where fits are quick."""
 
 
 def recipe(
-    scene: Scene,
+    data: Scene | BandTransfer,
     method: str | None = None,
     model: str | None = None,
     window: tuple[float, float] | None = None,
-    long_time: bool = True,
+    bootstrap: int | None = None,
     **settings: Any,
 ) -> Recipe:
     """The arguments of :func:`calibrate`, checked before hours go into an ensemble for them.
 
     Args:
-        scene: of the transfer to come.
-        method, model, window, settings: see :func:`calibrate`.
-        long_time: whether the transfer holds the long-time average.
+        data: the transfer, or the scene of one to come.
+        method, model, window, bootstrap, settings: see :func:`calibrate`.
     """
-    settings.pop("bootstrap", None)
-    if method is not None:
-        checks.choice("method", method, METHODS)
-    if model is not None:
-        checks.choice("model", model, MODELS)
-    if model is None and method is not None:
-        richest = "memory" if method == "projection" else "basis_matrix"
-        model = richest if long_time or (scene.damping > 0 and method == "projection") else "paper"
-    if model is not None and method is None:
-        method = "projection" if model == "memory" else "adam"
-    if method is not None and (method == "projection") != (model == "memory"):
-        fitting = "memory" if method == "projection" else ", ".join(BASES)
-        raise checks.fail("model", f"be one of {fitting} for method '{method}'", repr(model))
-    every = [entry.name for entry in fields(AdamSettings)]
-    allowed = {"adam": every, "projection": ["order"], None: ["order"]}.get(method, [])
-    checks.known_keys(f"settings of method '{method or 'projection'}'", settings, allowed)
-    order = settings.pop("order", None)
-    if order is not None:
-        order = checked_order(order, len(scene.times))
-        method, model = "projection", "memory"
-    if window is None:
-        window = NONLINEAR_WINDOW if method == "nonlinear" else LINEAR_WINDOW
-    window = checked_window(window)
-    if not scene.is_ordered:
-        within(scene.times, window, 4 if method == "nonlinear" else 2)
-    return Recipe(method, model, window, AdamSettings(**settings), order)
+    record = None if model is None else MODELS[checks.choice("model", model, MODELS)]
+    fit = None if method is None else methods()[checks.choice("method", method, methods())]
+    if record is None and fit is None and settings:  # they tell what they are settings of
+        record, fit = _owner(settings)
+    elif record is None and fit is not None:
+        record = _richest(fit, data)
+    elif record is not None and fit is None:
+        fit = record.fit()
+    if record is None or fit is None:
+        chosen, n_times, given = NoSettings(), 2, window or LINEAR_WINDOW
+    else:
+        if fit not in record.fits:
+            able = ", ".join(other.name for other in fitted_by(fit.name))
+            raise checks.fail("model", f"be one of {able} for method '{fit.name}'", repr(record.name))
+        checks.known_keys(f"settings of method '{fit.name}'", settings, fit.settings_names)
+        chosen, n_times, given = fit.settings(**settings), fit.least_times, window or fit.window
+        fit.check(chosen, len(data.times))
+    given = checked_window(given if window is None else window)
+    if not data.is_ordered:
+        within(data.times, given, n_times)
+    return Recipe(record, fit, given, chosen)
+
+
+def _owner(settings: dict[str, Any]) -> tuple[ReducedModel, Fit]:
+    """The model of the ladder whose fit has these settings."""
+    every = [(record, record.fit(record.climbed_by)) for record in MODELS.values() if record.climbed_by is not None]
+    for record, fit in reversed(every):
+        if set(settings) <= set(fit.settings_names):
+            return record, fit
+    names = dict.fromkeys(name for _, fit in every for name in fit.settings_names)
+    checks.known_keys("settings without a method", settings, names)
+    raise checks.fail("settings", "be those of one method", ", ".join(settings))
+
+
+def _richest(fit: Fit, data: Scene | BandTransfer) -> ReducedModel:
+    """The model where only the fit is named."""
+    damped = data.damping > 0
+    late = not damped if isinstance(data, Scene) else data.long_time is not None
+    known = isinstance(data, Scene) or data.scene is not None
+    able = fitted_by(fit.name)
+    return next((record for record in reversed(able) if record.default and record.suits(late, known, damped)), able[-1])
 
 
 def calibrate(
@@ -95,8 +105,8 @@ def calibrate(
         method: "analytic": Eq. 50 with q0 fitted to the linear procedure's rates; "linear" and "nonlinear": the
             procedures L and NL of Section 3.5 on the times in the window; "adam": Q from all times, starting from L;
             "projection": the model "memory" from all times. None for the one that fits the model best.
-        model: "paper" (basis energy Psi of Eq. 47), "exact_psi", "basis_matrix", "swing_in" or "memory" (all but the
-            first need the long-time average); None: the richest that the method fits.
+        model: "paper" (basis energy Psi of Eq. 47), "exact_psi", "basis_matrix", "swing_in", "memory" (all but the
+            first need the long-time average) or a registered one; None: the richest that the method fits.
         window: first and last time of the fits at short times; None for 0.5 to 2, "nonlinear" 0.5 to 4.5.
         bootstrap: number of ensembles drawn again for the error bars, 0 for none; None for 20, or none with methods
             that would take long ("adam", "nonlinear") and with fewer than 4 blocks of realizations.
@@ -114,137 +124,57 @@ def calibrate(
         FitWarning: naming how many entries of the nonlinear fit did not converge, or that Adam did not.
     """
     checks.instance("transfer", transfer, BandTransfer)
-    held = transfer.long_time is not None
-    asked = recipe(transfer.scene, method, model, window, held, **settings)
-    replicates = _replicates(bootstrap, asked.method, transfer)
-    if transfer.scene.is_ordered:
+    asked = recipe(transfer, method, model, window, **settings)
+    replicates = _replicates(bootstrap, asked.fit, transfer)
+    if transfer.is_ordered:
         return _ordered(transfer, asked)
-    report: dict[str, Any] = {}
-    with _counter(progress, None, "step") as step:
-        if asked.model is None or (asked.model == "memory" and asked.order is None):
-            asked, report = select(transfer, asked, step)
-        fitted, details = fit(Sample.of(transfer), asked, progress=step)
-        report = report | details
+    report, near, errors = Report(), None, None
+    with bar("calibrating", None, "step", progress) as shown:
+        if not asked.complete:
+            asked, selection, near = select(transfer, asked, shown.update)
+            report = replace(report, selection=selection)
+        sample = Sample.of(transfer)
+        fitted, told = asked.run(sample, near, shown.update)
+        report = replace(
+            report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=replicates
+        )
         _check_growth(fitted, asked)
-        uncertainty = None
         if replicates:
-            uncertainty = trust.bootstrap(transfer, asked, fitted, replicates, step)
-            report["bootstrap"] = replicates
-    limit = trust.horizon(transfer, fitted)
-    report["horizon"] = limit if math.isfinite(limit) else "infinite"
-    assert asked.method is not None, "chosen above"
-    assert asked.model is not None, "chosen above"
-    return MasterEquation(
-        fitted, Calibration(asked.method, asked.model, asked.window, transfer.scene, report), uncertainty
-    )
+            errors = draw_again(transfer, asked, fitted, replicates, shown.update)
+    return MasterEquation(fitted, _record(transfer, asked, report), errors)
 
 
-def _replicates(bootstrap: int | None, method: str | None, transfer: BandTransfer) -> int:
+def _record(transfer: BandTransfer, asked: Recipe, report: Report) -> Calibration:
+    method = "linear" if asked.fit is None else asked.fit.name
+    model = "paper" if asked.model is None else asked.model.name
+    words = "" if transfer.scene is not None else str(getattr(transfer, "provenance", "") or "")
+    return Calibration(method, model, asked.window, transfer.scene, report, words)
+
+
+def _replicates(bootstrap: int | None, fit: Fit | None, transfer: BandTransfer) -> int:
     blocks = len(transfer.block_counts)
     if bootstrap is None:
-        return REPLICATES if method not in ("adam", "nonlinear") and blocks >= 4 else 0
+        return REPLICATES if (fit is None or fit.quick) and blocks >= 4 else 0
     count = checks.integer("bootstrap", bootstrap, 0, 10**4)
     if count == 1 or (count and blocks < 2):
         raise checks.fail("bootstrap", "be 0, or at least 2 for at least 2 blocks of realizations", count)
     return count
 
 
-def _check_growth(model: TransferModel, chosen: Recipe) -> None:
-    if not isinstance(model, RateModel):
+def _check_growth(model: TransferModel, asked: Recipe) -> None:
+    if not isinstance(model, RateModel) or asked.fit is None:
         return
     growth = float(torch.linalg.eigvals(model.rates.detach()).real.max())
     if growth > 1e-6:
         warnings.warn(
-            f"rates fitted by '{chosen.method}' make energy grow as exp({growth:.3g} t): do not predict beyond t = {1 / growth:.3g}",
+            f"rates fitted by '{asked.fit.name}' make energy grow as exp({growth:.3g} t): do not predict beyond t = {1 / growth:.3g}",
             FitWarning,
             stacklevel=3,
         )
-
-
-def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
-    """The models that :func:`select` tries, from the fewest fitted numbers up."""
-    affordable = [order for order in LADDER if 2 * (order[0] + 2 * order[1]) <= len(transfer.times)]
-    if not affordable:
-        raise checks.fail("transfer", "have at least 2 times for model 'memory'", f"{len(transfer.times)}")
-    damped = transfer.scene.damping > 0
-    if asked.model == "memory" and not damped:
-        exact_basis(Sample.of(transfer))  # an error if there is none
-    memory = [replace(asked, method="projection", model="memory", order=order) for order in affordable]
-    if transfer.long_time is None and not damped:
-        memory = []
-    if asked.model == "memory":
-        return memory
-    usable = [name for name in BASES if name == "paper" or transfer.long_time is not None]
-    rated = [replace(asked, method="linear", model=name, order=None) for name in usable]
-    bands = transfer.n_bands**2
-    numbers = {
-        "paper": bands,
-        "exact_psi": bands + transfer.n_bands,
-        "basis_matrix": 2 * bands,
-        "swing_in": 2 * bands + 1,
-    }
-
-    def size(entry: Recipe) -> int:
-        if entry.order is None:
-            return numbers[entry.model or "paper"]
-        functions = entry.order[0] + 2 * entry.order[1]
-        return bands * (functions + damped) + functions
-
-    return sorted(rated + memory, key=size)
-
-
-def select(transfer: BandTransfer, asked: Recipe, progress: Any = None) -> tuple[Recipe, dict[str, Any]]:
-    """The first rung that, fitted on every other block, predicts the rest as well as the fitted blocks' means do.
-
-    As well: within 5 % in total variation, for the distance of two halves is itself uncertain by some per cent. If
-    none does, the nearest. Models with rates are tried with procedure L.
-
-    Returns:
-        The recipe of the rung, and what was tried: model, order, held-out distance.
-    """
-    candidates = rungs(asked, transfer)
-    blocks = len(transfer.block_counts)
-    if blocks < 4:
-        return candidates[-1], {"selection": "largest: too few blocks of realizations to hold some out"}
-    even = (torch.arange(blocks) + 1) % 2
-    seen, held = Sample.of_blocks(transfer, even), Sample.of_blocks(transfer, 1 - even).mean
-    used = transfer.times > 0
-    noise = float(total_variation(seen.mean, held)[:, used].mean())
-    enough = 1.05 * noise
-    tried: list[list[Any]] = []
-    for candidate in candidates:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FitWarning)
-            model, _ = fit(seen, candidate, progress=progress)
-        distance = float(total_variation(model.transfer(transfer.times).detach(), held)[:, used].mean())
-        tried.append([candidate.model, list(candidate.order or ()), distance])
-        if distance <= enough:
-            break
-    best = len(tried) - 1 if tried[-1][2] <= enough else min(range(len(tried)), key=lambda i: tried[i][2])
-    reached = "reaches" if tried[best][2] <= enough else "comes nearest to"
-    return candidates[best], {
-        "selection": f"smallest model that {reached} the distance of the two halves of the ensemble",
-        "held_out_distance": tried[best][2],
-        "halves_distance": noise,
-        "tried": tried,
-    }
 
 
 def _ordered(transfer: BandTransfer, asked: Recipe) -> MasterEquation:
     """Without disorder no energy leaves its band: all of it is basis energy and every rate is zero."""
     n = transfer.n_bands
     model = RateModel(torch.zeros(n, n, dtype=torch.float64), torch.ones(n, dtype=torch.float64))
-    record = Calibration(
-        asked.method or "linear", asked.model or "paper", asked.window, transfer.scene, {"ordered": True}
-    )
-    return MasterEquation(model, record)
-
-
-@contextmanager
-def _counter(progress: bool, total: int | None, unit: str) -> Iterator[Callable[[int], Any] | None]:
-    """What a fit calls as it goes on: a bar's update on a terminal, or None."""
-    if not progress:
-        yield None
-        return
-    with tqdm(total=total, unit=unit, disable=None, leave=False) as bar:
-        yield bar.update
+    return MasterEquation(model, _record(transfer, asked, Report(ordered=True)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,15 @@ from torch import Tensor, nn
 
 from torchchain import checks
 from torchchain.chain.excitation import StandingWave
-from torchchain.ensemble.scene import Scene
-from torchchain.master import artifact
+from torchchain.ensemble.printed import Printed
+from torchchain.ensemble.scene import Scene, describe
+from torchchain.master import file
+from torchchain.master.fits import AnalyticReport
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
-from torchchain.master.solvers import SOLVERS, IntegrationError
-from torchchain.master.trust import Uncertainty
+from torchchain.master.report import Calibration, Report
+from torchchain.master.solving import SOLVERS, IntegrationError
+from torchchain.master.uncertainty import Uncertainty
 from torchchain.threads import single_thread
 
 NEGATIVE_SHARE = 1e-3
@@ -31,30 +34,20 @@ class TrustWarning(UserWarning):
     """A prediction beyond what the model was compared with, or with energies that cannot be."""
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """How a master equation came to be: method, model, fit window, scene and the report of the fit."""
-
-    method: str
-    model: str
-    window: tuple[float, float] | None
-    scene: Scene
-    report: dict[str, Any] = field(default_factory=dict)
-
-
-class MasterEquation(nn.Module):
+class MasterEquation(Printed, nn.Module):
     """Predicts the energy in every band at any later time, from any start over the bands.
 
-    Row vectors: e(t) = e(0) T(t), and Q[s, r] is the rate from band s to band r. Units: share of the energy, and
-    travel times of sound over one particle.
+    Row vectors: e(t) = e(0) T(t). Units: share of the energy, and travel times of sound over one particle.
 
     Args:
-        model: the rate model.
+        model: the reduced model.
         calibration: where it comes from.
         uncertainty: standard errors by bootstrap; None if there are none.
     """
 
-    def __init__(self, model: TransferModel, calibration: Calibration, uncertainty: Uncertainty | None = None) -> None:
+    def __init__(
+        self, model: TransferModel, calibration: Calibration | None, uncertainty: Uncertainty | None = None
+    ) -> None:
         super().__init__()
         checks.instance("model", model, TransferModel)
         checks.instance("calibration", calibration, Calibration, type(None))
@@ -65,8 +58,16 @@ class MasterEquation(nn.Module):
 
     @property
     def rates(self) -> Tensor:
-        """Q [source, receiver]; rows sum to zero where energy is conserved."""
+        """[source, receiver], per unit time: of a model with rates its Q, of others what :attr:`rates_meaning` says.
+
+        The paper's Q of any transfer, with standard errors, is :func:`torchchain.paper_rates`.
+        """
         return self.model.rates
+
+    @property
+    def rates_meaning(self) -> str:
+        """What :attr:`rates` are, in words."""
+        return self.model.rates_meaning
 
     @property
     def basis(self) -> Tensor:
@@ -76,22 +77,49 @@ class MasterEquation(nn.Module):
     @property
     def damping(self) -> Tensor:
         """d [band], the dissipation rate of Eq. 51."""
-        found = self._report.get("damping")
-        return self.model.damping if found is None else torch.tensor(found).to(self.rates)
+        loss = self._report.loss
+        return self.model.damping if loss is None else torch.tensor(loss.rates).to(self.basis)
 
     @property
-    def _report(self) -> dict[str, Any]:
-        return {} if self.calibration is None else self.calibration.report
+    def n_parameters(self) -> int:
+        """Fitted numbers."""
+        if isinstance(self._report.fit, AnalyticReport):
+            return 1
+        return self.model.n_parameters
+
+    @property
+    def _report(self) -> Report:
+        return Report() if self.calibration is None else self.calibration.report
 
     @property
     def horizon(self) -> float:
         """Time up to which predictions were compared with chains; infinity where these had settled, or if unknown."""
-        limit = self._report.get("horizon", math.inf)
-        return math.inf if limit == "infinite" else float(limit)
+        return self._report.horizon
 
     @property
     def n_bands(self) -> int:
         return self.model.n_bands
+
+    def _rows(self) -> dict[str, str]:
+        rows = {"bands": f"{self.n_bands}", "model": f"{self.model.kind}: {self.model.words}"}
+        if self.calibration is not None:
+            record, scene = self.calibration, self.calibration.scene
+            rows["model"] = f"{record.model}, fitted by {record.method}: {self.model.words}"
+            rows["calibrated on"] = (
+                describe(scene) if scene is not None else record.provenance or "data without a scene"
+            )
+            rows["compared with chains"] = "at all times" if self.horizon == math.inf else f"up to t = {self.horizon:g}"
+        if self.uncertainty is not None:
+            rows["standard error"] = f"of a share of the energy at most {float(self.uncertainty.stderr.max()):.1e}"
+        selection = self._report.selection
+        if selection is not None and selection.held_out_distance is not None:
+            rows["held-out distance"] = (
+                f"{selection.held_out_distance:.4f}, of two halves {selection.halves_distance:.4f}"
+            )
+        if bool(self.damping.any()):
+            rows["damping"] = f"{float(self.damping.min()):.3g} to {float(self.damping.max()):.3g} per unit time"
+        rows["conservation defect"] = f"{self.conservation_defect:.1e}"
+        return rows | {"rates": self.rates_meaning}
 
     def solve(self, initial: Any, times: Any, method: str = "expm", *, supply: Any = None, **options: Any) -> Tensor:
         """Band energies at the given times.
@@ -113,6 +141,12 @@ class MasterEquation(nn.Module):
 
         Warns:
             TrustWarning: for times beyond the model's horizon, for a band with a clearly negative energy, and for energy made.
+
+        Example:
+            >>> import torch, torchchain as tc
+            >>> model = tc.RateModel(torch.tensor([[-0.3, 0.3], [0.0, 0.0]]), torch.zeros(2))
+            >>> tc.MasterEquation(model, None).solve([1.0, 0.0], [0.0, 1e3]).round(decimals=3).tolist()
+            [[1.0, 0.0], [0.0, 1.0]]
         """
         solver = SOLVERS[checks.choice("method", method, SOLVERS)]
         checks.known_keys(f"options of solver '{method}'", options, solver.options)
@@ -125,6 +159,10 @@ class MasterEquation(nn.Module):
             raise IntegrationError(f"solver '{method}' must stay finite, got overflow up to time {float(times[-1]):g}")
         self._warn(initial, times, fed, energy.detach())
         return energy
+
+    def transfer(self, times: Any) -> Tensor:
+        """T(t) [source, time, receiver]: :meth:`solve` from a unit energy in each band, with its errors and warnings."""
+        return self.solve(torch.eye(self.n_bands).to(self.basis), times)
 
     def _initial(self, initial: Any) -> Tensor:
         initial = checks.real_tensor("initial", initial).to(self.rates)
@@ -203,22 +241,21 @@ class MasterEquation(nn.Module):
         strengths. The chain's length may change where the wave has not yet gone round: the rates belong to bands, not to tones.
         """
         checks.instance("scene", scene, Scene)
-        own, found = self.calibration.scene, []
-        for name, label in (
-            ("n_bands", "bands"),
-            ("boundary", "boundary"),
-            ("damping", "damping"),
-            ("contact", "contact"),
-        ):
+        own = None if self.calibration is None else self.calibration.scene
+        end, found = float(scene.times[-1]), []
+        if scene.n_bands != self.n_bands:
+            found.append(f"bands {scene.n_bands}, calibrated on {self.n_bands}")
+        if end > self.horizon:
+            found.append(f"times to {end:g}, compared with chains to {self.horizon:g}")
+        if own is None:
+            return [*found, "chains that are described, where its own energies came without a scene"]
+        for name in ("boundary", "damping", "contact"):
             if getattr(scene, name) != getattr(own, name):
-                found.append(f"{label} {getattr(scene, name)}, calibrated on {getattr(own, name)}")
+                found.append(f"{name} {getattr(scene, name)}, calibrated on {getattr(own, name)}")
         if scene.disorder.kind != own.disorder.kind or scene.stiffness_disorder != own.stiffness_disorder:
             found.append("another kind of disorder")
         if abs(scene.disorder.strength - own.disorder.strength) > 1e-9:
             found.append(f"disorder {scene.disorder.strength:g}, calibrated on {own.disorder.strength:g}")
-        end = float(scene.times[-1])
-        if end > self.horizon:
-            found.append(f"times to {end:g}, compared with chains to {self.horizon:g}")
         shorter = min(scene.n_particles, own.n_particles)
         if scene.n_particles != own.n_particles and end > shorter:
             found.append(
@@ -236,21 +273,30 @@ class MasterEquation(nn.Module):
             FieldError: for a number of bands that does not divide the present one, or a model without memory.
         """
         if not isinstance(self.model, MemoryModel):
-            raise checks.fail("model", "be 'memory' to be coarsened", repr(self.calibration.model))
+            name = self.model.kind if self.calibration is None else self.calibration.model
+            raise checks.fail("model", "be 'memory' to be coarsened", repr(name))
         n_bands = checks.integer("n_bands", n_bands, 1, self.n_bands)
         if self.n_bands % n_bands:
             raise checks.fail("n_bands", f"divide the {self.n_bands} bands of the model", n_bands)
         size = self.n_bands // n_bands
-        joined = torch.eye(n_bands, dtype=self.rates.dtype, device=self.rates.device).repeat_interleave(size, dim=0)
+        joined = torch.eye(n_bands).to(self.basis).repeat_interleave(size, dim=0)
         tensors = self.model.tensors()
         for name in ("rates", "basis", "amplitudes"):
             tensors[name] = joined.T / size @ tensors[name] @ joined
         tensors["damping"] = tensors["damping"] @ joined / size
-        scene = self.calibration.scene
-        assert isinstance(scene.excitation, StandingWave), "transfers come from standing waves"
-        scene = replace(scene, n_bands=n_bands, excitation=replace(scene.excitation, tones=None))
-        report = {"coarsened_from": self.n_bands, "horizon": self._report.get("horizon", "infinite")}
-        return MasterEquation(MemoryModel(**tensors), replace(self.calibration, scene=scene, report=report))
+        record, errors = self.calibration, self.uncertainty
+        if record is not None:
+            record = replace(record, scene=_joined_scene(record.scene, n_bands), report=self._joined_report(joined))
+        return MasterEquation(
+            MemoryModel(**tensors), record, None if errors is None else errors.coarsened(joined.to(errors.stderr))
+        )
+
+    def _joined_report(self, joined: Tensor) -> Report:
+        loss = self._report.loss
+        if loss is not None:
+            rates = torch.tensor(loss.rates).to(joined) @ joined / joined.sum(0)
+            loss = replace(loss, rates=tuple(rates.tolist()))
+        return Report(loss=loss, horizon=self.horizon, bootstrap=self._report.bootstrap, coarsened_from=self.n_bands)
 
     def forward(self, initial: Tensor, times: Tensor) -> Tensor:
         """:meth:`solve` by the matrix exponential."""
@@ -268,8 +314,14 @@ class MasterEquation(nn.Module):
         return min(0.0, float((rates - torch.diag(rates.diagonal())).min()))
 
     def save(self, path: str | Path) -> None:
-        """Write the model as safetensors, all or nothing."""
-        artifact.save(self.model, self.calibration.__dict__, self.uncertainty, path)
+        """Write the model as safetensors, all or nothing.
+
+        Raises:
+            FieldError: without a calibration, and where the file cannot be written.
+        """
+        if self.calibration is None:
+            raise checks.fail("calibration", "be there for a model to be saved", None)
+        file.save((self.model, self.calibration, self.uncertainty), path)
 
     @classmethod
     def load(cls, path: str | Path) -> MasterEquation:
@@ -278,5 +330,12 @@ class MasterEquation(nn.Module):
         Raises:
             FieldError: naming the file and what is wrong with it.
         """
-        model, record, uncertainty = artifact.load(path)
-        return cls(model, Calibration(**record), uncertainty)
+        return cls(*file.load(path))
+
+
+def _joined_scene(scene: Scene | None, n_bands: int) -> Scene | None:
+    """The scene with fewer bands and their center tones."""
+    if scene is None:
+        return None
+    assert isinstance(scene.excitation, StandingWave), "transfers come from standing waves"
+    return replace(scene, n_bands=n_bands, excitation=replace(scene.excitation, tones=None))

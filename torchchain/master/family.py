@@ -13,18 +13,21 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.ensemble.printed import Printed
+from torchchain.ensemble.scene import Scene, describe
 from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master import artifact
+from torchchain.master import file
 from torchchain.master.calibration import calibrate
-from torchchain.master.equation import Calibration, MasterEquation
+from torchchain.master.equation import MasterEquation
 from torchchain.master.memory import MemoryModel
-from torchchain.master.trust import Uncertainty
+from torchchain.master.report import Calibration, Loss, Report
+from torchchain.master.uncertainty import Uncertainty
 
 NEIGHBORS = 4
 
 
-class MasterFamily:
+class MasterFamily(Printed):
     """Master equations of the same bands and chains for several strengths xi of the disorder.
 
     At a strength between them the transfer is a weighted sum of those of up to four neighbors, with the weights of
@@ -48,12 +51,16 @@ class MasterFamily:
         for member in members:
             checks.instance("members", member, MasterEquation)
             checks.instance("members' calibration", member.calibration, Calibration)
-        self.members = tuple(sorted(members, key=lambda member: member.calibration.scene.disorder.strength))
-        first = self.members[0].calibration.scene
+            if member.calibration.scene is None:
+                raise checks.fail(
+                    "members", "be calibrated on chains of a scene", member.calibration.provenance or "no scene"
+                )
+        self.members = tuple(sorted(members, key=lambda member: scene_of(member).disorder.strength))
+        first = scene_of(self.members[0])
         for member in self.members:
-            scene = member.calibration.scene
+            scene = scene_of(member)
             if not isinstance(member.model, MemoryModel):
-                raise checks.fail("members", "have the model 'memory'", repr(member.calibration.model))
+                raise checks.fail("members", "have the model 'memory'", repr(_record(member).model))
             for name in ("n_particles", "n_bands", "boundary", "contact", "damping", "stiffness_disorder"):
                 if getattr(scene, name) != getattr(first, name):
                     raise checks.fail(
@@ -68,7 +75,7 @@ class MasterFamily:
     @property
     def strengths(self) -> tuple[float, ...]:
         """xi of the members, increasing."""
-        return tuple(member.calibration.scene.disorder.strength for member in self.members)
+        return tuple(scene_of(member).disorder.strength for member in self.members)
 
     def weights(self, strength: float) -> dict[float, float]:
         """Weight of every member, by its strength, and of the chain without disorder, 0.0, at a strength."""
@@ -97,24 +104,24 @@ class MasterFamily:
             FieldError: for a larger one.
         """
         weights = self.weights(strength)
-        chosen = {m.calibration.scene.disorder.strength: m for m in self.members}
+        chosen = dict(zip(self.strengths, self.members, strict=True))
         if len(weights) == 1:  # a member's own strength
             return chosen[next(iter(weights))]
         parts = [(w, chosen[xi]) for xi, w in weights.items() if xi in chosen]
-        scene = parts[0][1].calibration.scene
+        record = _record(parts[0][1])
+        scene = scene_of(parts[0][1])
         scene = replace(scene, disorder=replace(scene.disorder, strength=float(strength)))
-        limits = [member.horizon for _, member in parts]
-        report: dict[str, Any] = {
-            "interpolated": [[xi, weight] for xi, weight in weights.items()],
-            "horizon": min(limits) if math.isfinite(min(limits)) else "infinite",
-        }
-        damping = [
-            torch.as_tensor(m.calibration.report["damping"]) * w for w, m in parts if "damping" in m.calibration.report
-        ]
-        if damping:
-            report["damping"] = torch.stack(damping).sum(0).tolist()
-        record = Calibration("projection", "memory", parts[0][1].calibration.window, scene, report)
-        return MasterEquation(_combined(parts, weights.get(0.0, 0.0)), record, _combined_errors(parts))
+        losses = [(w, _record(m).report.loss) for w, m in parts]
+        report = Report(
+            interpolated=tuple(weights.items()),
+            horizon=min(member.horizon for _, member in parts),
+            loss=_combined_loss(losses),
+        )
+        return MasterEquation(
+            _combined(parts, weights.get(0.0, 0.0)),
+            replace(record, scene=scene, report=report),
+            _combined_errors(parts),
+        )
 
     def solve(self, initial: Any, times: Any, strength: float, method: str = "expm", **options: Any) -> Tensor:
         """Band energies at a strength; see :meth:`MasterEquation.solve`."""
@@ -131,14 +138,14 @@ class MasterFamily:
         for i in range(1, len(self.members) - 1):
             member = self.members[i]
             others = MasterFamily([*self.members[:i], *self.members[i + 1 :]])
-            strength = member.calibration.scene.disorder.strength
+            strength = self.strengths[i]
             there = others.at(strength).model.transfer(times)
             found.append((strength, float(total_variation(there, member.model.transfer(times)).mean())))
         return found
 
     def save(self, path: str | Path) -> None:
         """Write all members to one safetensors file, all or nothing."""
-        artifact.save_family([(m.model, m.calibration.__dict__, m.uncertainty) for m in self.members], path)
+        file.save_family([(m.model, _record(m), m.uncertainty) for m in self.members], path)
 
     @classmethod
     def load(cls, path: str | Path) -> MasterFamily:
@@ -147,8 +154,30 @@ class MasterFamily:
         Raises:
             FieldError: naming the file and what is wrong with it.
         """
-        members = artifact.load_family(path)
-        return cls([MasterEquation(model, Calibration(**record), errors) for model, record, errors in members])
+        return cls([MasterEquation(*member) for member in file.load_family(path)])
+
+    def _rows(self) -> dict[str, str]:
+        first, found = self.members[0], self.strengths
+        return {
+            "members": f"{len(found)}, at disorder {', '.join(f'{xi:g}' for xi in found)}",
+            "predicts at": f"any disorder from 0 to {found[-1]:g}: family.at(strength), family.solve(initial, times, strength)",
+            "bands": f"{first.n_bands}",
+            "models": "; ".join(member.model.words for member in self.members),
+            "first calibrated on": describe(scene_of(first)),
+            "compared with chains": f"up to t = {min(member.horizon for member in self.members):g}",
+        }
+
+
+def _record(member: MasterEquation) -> Calibration:
+    assert member.calibration is not None, "a family's constructor has checked it"
+    return member.calibration
+
+
+def scene_of(member: MasterEquation) -> Scene:
+    """The scene that a member was calibrated on."""
+    scene = _record(member).scene
+    assert scene is not None, "a family's constructor has checked it"
+    return scene
 
 
 def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> MasterFamily:
@@ -191,6 +220,15 @@ def _combined(parts: Sequence[tuple[float, MasterEquation]], idle: float) -> Mem
         pair_frequency=joined("pair_frequency"),
         damping=None,
     )
+
+
+def _combined_loss(losses: Sequence[tuple[float, Loss | None]]) -> Loss | None:
+    """The weighted sum of the damping of members."""
+    held = [(weight, loss) for weight, loss in losses if loss is not None]
+    if len(held) < len(losses):
+        return None
+    rates = torch.stack([weight * torch.tensor(loss.rates, dtype=torch.float64) for weight, loss in held]).sum(0)
+    return Loss(tuple(rates.clamp(min=0).tolist()), max(loss.misfit for _, loss in held))
 
 
 def _combined_errors(parts: Sequence[tuple[float, MasterEquation]]) -> Uncertainty | None:

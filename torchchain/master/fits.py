@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,21 @@ from torchchain import checks
 
 class FitWarning(UserWarning):
     """Some entries of a fit did not converge."""
+
+
+@dataclass(frozen=True)
+class AnalyticReport:
+    """q0 of Eq. 50 and its standard error."""
+
+    q0: float
+    q0_stderr: float
+
+
+@dataclass(frozen=True)
+class NonlinearReport:
+    """Pairs of bands (source, receiver), counted from 1, in which the fit did not converge."""
+
+    unconverged: tuple[tuple[int, int], ...]
 
 
 def checked_window(window: tuple[float, float] | list[float]) -> tuple[float, float]:
@@ -49,9 +65,15 @@ def linear_rates(times: Tensor, mean: Tensor, free: Tensor, window: tuple[float,
         Q [source, receiver]. Rows sum to zero to rounding, because the energies sum to 1 at every time.
     """
     inside = within(times, window, 2)
-    t = times[inside] - times[inside].mean()
-    slope = torch.einsum("t,str->sr", t, mean[:, inside]) / t.square().sum()
-    return slope / free[:, None]
+    change = mean[:, inside] - mean[:, inside][:, :1]  # exactly zero where nothing moves, whatever the free share
+    return torch.einsum("t,str->sr", linear_weights(times, window)[inside], change) / free[:, None]
+
+
+def linear_weights(times: Tensor, window: tuple[float, float]) -> Tensor:
+    """Weight of every time, (time,), in the slope of the straight line through the values in the window."""
+    inside = within(times, window, 2)
+    t = torch.where(inside, times - times[inside].mean(), 0.0)
+    return t / t.square().sum()
 
 
 def linear_delay(times: Tensor, mean: Tensor, window: tuple[float, float]) -> Tensor:

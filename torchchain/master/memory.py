@@ -1,22 +1,26 @@
-"""Transfer with memory: a few decay rates shared by all pairs of bands, fitted by variable projection."""
+"""The reduced model with memory: a few decay rates shared by all pairs of bands."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from scipy import optimize
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.fits import linear_weights
 from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping
+from torchchain.master.projection import Order, Poles, Projection, search
+from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
+from torchchain.master.sample import Sample, block_weights, exact_basis, leading_vectors
+from torchchain.threads import single_blas_thread
 
-SLOWEST, FASTEST = 1e-4, 6.0
-LADDER = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 3), (2, 4), (3, 4), (3, 5), (3, 6), (4, 6), (5, 8))
-"""Orders that are tried one after the other: numbers of exponentials and of pairs."""
+ORDERS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 3), (2, 4), (3, 4), (3, 5), (3, 6), (4, 6), (5, 8))
+"""Numbers of exponentials and of pairs that selection tries one after the other."""
 
 
 class MemoryModel(TransferModel):
@@ -28,7 +32,8 @@ class MemoryModel(TransferModel):
     for Pi and one for every f_m, in which it solves like any rate equation, from any start.
 
     Args:
-        rates: Q [source, receiver] of the linear procedure at short times, for comparison; the prediction does not use it.
+        rates: slopes of the ensemble's energies at short times [source, receiver], see ``rates_meaning``; the prediction
+            does not use them.
         basis: Pi [source, receiver].
         amplitudes: A_m [function, source, receiver], the exponentials first, then cosine and sine of every pair.
         decay: g of the exponentials [exponential], per unit time.
@@ -36,7 +41,16 @@ class MemoryModel(TransferModel):
         damping: d [receiver], per unit time.
     """
 
-    kind = "memory"
+    kind: ClassVar[str] = "memory"
+    axes: ClassVar[dict[str, tuple[str, ...]]] = {
+        "rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",),
+        "amplitudes": ("function", "band", "band"), "decay": ("function",),
+        "pair_decay": ("function",), "pair_frequency": ("function",),
+    }  # fmt: skip
+    rates_meaning: ClassVar[str] = (
+        "mean slope of the energies in the calibration's window, per energy of the source; the prediction does not use it, "
+        "and it is not the paper's Q (torchchain.paper_rates)"
+    )
 
     def __init__(
         self,
@@ -64,7 +78,8 @@ class MemoryModel(TransferModel):
         shape = (len(decay) + 2 * len(pair_decay), *rates.shape)
         if tuple(amplitudes.shape) != shape or pair_frequency.shape != pair_decay.shape:
             raise checks.fail("amplitudes", f"have shape {shape}", f"shape {tuple(amplitudes.shape)}")
-        start = basis + amplitudes[self._starts_at_one(len(decay), len(pair_decay))].sum(0)
+        single = len(decay)
+        start = basis + amplitudes[:single].sum(0) + amplitudes[single::2].sum(0)
         identity = torch.eye(len(rates), dtype=start.dtype)
         checks.first_bad(
             "amplitudes", "add up to 1 - basis at time 0", start, (start - identity).abs() > 1e-6 * (1 + amplitudes.abs().max()), "receiver"
@@ -81,17 +96,14 @@ class MemoryModel(TransferModel):
         self.pair_decay: Tensor
         self.pair_frequency: Tensor
 
-    @staticmethod
-    def _starts_at_one(exponentials: int, pairs: int) -> list[int]:
-        return [*range(exponentials), *range(exponentials, exponentials + 2 * pairs, 2)]
-
     @property
     def rates(self) -> Tensor:
         return self._rates
 
     @property
     def n_parameters(self) -> int:
-        return self.basis.numel() + self.amplitudes[1:].numel() + len(self.decay) + 2 * len(self.pair_decay)
+        kept = self.basis.numel() if bool(self.basis.any()) else 0
+        return kept + self.amplitudes[1:].numel() + len(self.decay) + 2 * len(self.pair_decay)
 
     @property
     def conservation_defect(self) -> float:
@@ -99,9 +111,9 @@ class MemoryModel(TransferModel):
         leak = (self.basis.sum(-1) - 1).abs() + self.amplitudes.sum(-1).abs().sum(0)
         return float(leak.max())
 
-    def tensors(self) -> dict[str, Tensor]:
-        names = ("basis", "amplitudes", "decay", "pair_decay", "pair_frequency", "damping")
-        return {"rates": self.rates, **{name: getattr(self, name) for name in names}}
+    @property
+    def words(self) -> str:
+        return f"{len(self.decay)} exponentials, {len(self.pair_decay)} pairs, {self.n_parameters} fitted numbers"
 
     def functions(self, times: Tensor) -> Tensor:
         """f_m at each time, (time, function)."""
@@ -132,139 +144,161 @@ class MemoryModel(TransferModel):
         )
 
 
-def checked_order(order: Any, n_times: int) -> tuple[int, int]:
+@dataclass(frozen=True)
+class ProjectionSettings:
+    """Settings of the projection: the order, None for the smallest that reaches the ensemble's own error."""
+
+    order: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.order is None:
+            return
+        if not isinstance(self.order, (tuple, list)) or len(self.order) != 2:
+            raise checks.FieldTypeError(f"order must be two integers, got {checks.shown(self.order)}")
+        object.__setattr__(
+            self,
+            "order",
+            (checks.integer("order", self.order[0], 1, 16), checks.integer("order", self.order[1], 0, 16)),
+        )
+
+
+@dataclass(frozen=True)
+class ProjectionReport:
+    """Whether the search for the rates ended by itself, the root mean square misfit, and the order."""
+
+    converged: bool
+    misfit: float
+    order: tuple[int, int]
+
+
+def checked_order(order: Any, n_times: int) -> Order:
     """Numbers of exponentials and of pairs, no more functions than half the times can tell apart."""
-    if not isinstance(order, (tuple, list)) or len(order) != 2:
-        raise checks.FieldTypeError(f"order must be two integers, got {checks.shown(order)}")
-    single, pairs = checks.integer("order", order[0], 1, 16), checks.integer("order", order[1], 0, 16)
+    single, pairs = checked = ProjectionSettings(order).order or ORDERS[0]
     if 2 * (single + 2 * pairs) > n_times:
         raise checks.fail("order", f"have at most {n_times // 2} functions for {n_times} times", (single, pairs))
-    return single, pairs
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Residual energy D(t) = T(t) - Pi as (time, entry), and its value I - Pi at time 0 as (entry,)."""
-
-    times: np.ndarray
-    data: np.ndarray
-    at_zero: np.ndarray
-
-    def functions(self, p: np.ndarray, order: tuple[int, int]) -> np.ndarray:
-        g, w = np.exp(p[: sum(order)]), np.exp(p[sum(order) :])
-        columns = [np.exp(-rate * self.times) for rate in g[: order[0]]]
-        for rate, frequency in zip(g[order[0] :], w, strict=True):
-            envelope = np.exp(-rate * self.times)
-            columns += [envelope * np.cos(frequency * self.times), envelope * np.sin(frequency * self.times)]
-        return np.stack(columns, axis=1)
-
-    def amplitudes(self, functions: np.ndarray, order: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Best amplitudes under the constraint at time 0, the misfit, and an orthonormal basis of what is free."""
-        start = np.concatenate([np.ones(order[0]), np.tile([1.0, 0.0], order[1])])
-        free = functions[:, 1:] - functions[:, :1] * start[1:]  # the first function takes up the constraint
-        rest = self.data - functions[:, :1] * self.at_zero
-        if free.shape[1] == 0:
-            return self.at_zero[None], rest, free
-        left, scale, right = np.linalg.svd(free, full_matrices=False)
-        held = scale > 1e-6 * scale[0]
-        left = left[:, held]
-        part = left.T @ rest
-        best = (right[held].T / scale[held]) @ part
-        return np.vstack([self.at_zero - start[1:] @ best, best]), rest - left @ part, left
-
-    def jacobian(self, p: np.ndarray, order: tuple[int, int]) -> np.ndarray:
-        """Derivative of the misfit to the logarithms of rates and frequencies (Kaufman 1975), (misfit, parameter)."""
-        functions = self.functions(p, order)
-        amplitudes, _, left = self.amplitudes(functions, order)
-        t, (single, pairs) = self.times[:, None], order
-        g, w = np.exp(p[: single + pairs]), np.exp(p[single + pairs :])
-        slopes = [-g[i] * t * functions[:, i, None] * amplitudes[i] for i in range(single)]
-        turns = []
-        for j in range(pairs):
-            c, s = single + 2 * j, single + 2 * j + 1
-            cosine, sine = functions[:, c, None], functions[:, s, None]
-            slopes.append(-g[single + j] * t * (cosine * amplitudes[c] + sine * amplitudes[s]))
-            turns.append(w[j] * t * (cosine * amplitudes[s] - sine * amplitudes[c]))
-        columns = [slope - left @ (left.T @ slope) for slope in (*slopes, *turns)]
-        return -np.stack([column.ravel() for column in columns], axis=1)
+    return checked
 
 
 def fit_memory(
-    times: Tensor,
-    mean: Tensor,
-    basis: Tensor,
-    order: tuple[int, int],
-    starts: int = 6,
-    progress: Callable[[int], Any] | None = None,
-    near: MemoryModel | None = None,
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Least squares over all times: amplitudes by linear algebra, the few rates by Levenberg-Marquardt (variable projection).
+    times: Tensor, mean: Tensor, basis: Tensor, order: Order, *, near: MemoryModel | None = None,
+    leading: np.ndarray | None = None, progress: Progress = None,
+) -> tuple[dict[str, Tensor], ProjectionReport]:  # fmt: skip
+    """Least squares over all times: amplitudes by linear algebra, the few rates by :func:`search`.
 
-    Golub and Pereyra (1973) with Kaufman's simplification. Energy is conserved exactly, because the amplitudes are
-    linear in data whose rows sum to the same at every time. The rates are fitted on the leading singular vectors of
-    the data, from several starts; deterministic.
+    Energy is conserved exactly, because the amplitudes are linear in data whose rows sum to the same at every time. The
+    rates are searched on the leading singular vectors of the data.
 
     Args:
         times: (time,).
         mean: T [source, time, receiver].
         basis: Pi [source, receiver].
         order: number of exponentials (at least 1) and of pairs.
-        starts: starts of the search.
-        progress: called with 1 after every start.
-        near: a model of the same order of similar data: the search starts at its rates, and nowhere else.
+        near: a model of similar data and the same order, to start from.
+        leading: right singular vectors of the data, (entry, vector), where known.
+        progress: called with 1 after every step.
 
     Returns:
-        Tensors for :class:`MemoryModel` but the rates, and a report: converged, root mean square misfit.
+        Tensors for :class:`MemoryModel` but the rates, and a report.
     """
-    single, pairs = order = checked_order(order, len(times))
-    n = len(basis)
+    order = checked_order(order, len(times))
     data = (mean - basis[:, None]).transpose(0, 1).reshape(len(times), -1).numpy()
-    at_zero = (torch.eye(n, dtype=basis.dtype) - basis).flatten().numpy()
-    full = _Problem(times.numpy(), data, at_zero)
-    left, scale, right = np.linalg.svd(data, full_matrices=False)
-    kept = min(24, len(scale))
-    small = _Problem(times.numpy(), left[:, :kept] * scale[:kept], right[:kept] @ at_zero)
-    end = float(times[-1])
-    generator = np.random.Generator(np.random.Philox(key=np.array([single, pairs], dtype=np.uint64)))
-    lower = np.log(np.concatenate([np.full(single + pairs, SLOWEST), np.full(pairs, 1e-2)]))
-    best: Any = None
-    for _ in range(starts if near is None else 1):
-        g = np.exp(generator.uniform(np.log(max(SLOWEST * 2, 1 / end)), np.log(1.5), single + pairs))
-        w = np.exp(generator.uniform(np.log(0.03), np.log(1.0), pairs))
-        if near is not None:
-            inner = np.log([SLOWEST * 1.01, FASTEST / 1.01])
-            g = np.exp(np.clip(torch.cat([near.decay, near.pair_decay]).log().numpy(), *inner))
-            w = np.exp(np.clip(near.pair_frequency.log().numpy(), np.log(1.01e-2), inner[1]))
-        found = optimize.least_squares(
-            lambda p: small.amplitudes(small.functions(p, order), order)[1].ravel(),
-            np.log(np.concatenate([g, w])),
-            jac=lambda p: small.jacobian(p, order),
-            bounds=(lower, np.log(FASTEST)),
-            ftol=1e-6,
-            xtol=1e-6,
-            gtol=1e-12,
-            max_nfev=150,
-        )
-        if best is None or found.cost < best.cost:
-            best = found
-        if progress is not None:
-            progress(1)
-    amplitudes, misfit, _ = full.amplitudes(full.functions(best.x, order), order)
-    amplitudes = amplitudes.reshape(-1, n, n)
-    if (
-        float((mean.sum(-1) - basis.sum(-1)[:, None]).abs().max()) < 1e-9
-    ):  # rounding in the data, times large amplitudes
+    at_zero = (torch.eye(len(basis), dtype=basis.dtype) - basis).flatten().numpy()
+    leading = leading_vectors(data) if leading is None else leading
+    small = Projection(times.numpy(), data @ leading, at_zero @ leading)
+    poles, ended = search(small, order, None if near is None else _poles(near), progress)
+    amplitudes, misfit, _ = Projection(times.numpy(), data, at_zero).amplitudes(poles)
+    report = ProjectionReport(ended, float(np.sqrt(np.mean(misfit**2))), order)
+    return _tensors(basis, poles, amplitudes, _conserved(mean, basis)), report
+
+
+def _poles(model: MemoryModel) -> Poles:
+    return Poles(model.decay.numpy(), model.pair_decay.numpy(), model.pair_frequency.numpy())
+
+
+def _conserved(mean: Tensor, basis: Tensor) -> bool:
+    """Whether the energies sum to what stays at every time; amplitudes sum to zero then, but for rounding."""
+    return float((mean.sum(-1) - basis.sum(-1)[:, None]).abs().max()) < 1e-9
+
+
+def _tensors(basis: Tensor, poles: Poles, amplitudes: np.ndarray, conserved: bool) -> dict[str, Tensor]:
+    amplitudes = amplitudes.reshape(-1, *basis.shape)
+    if conserved:
         amplitudes = amplitudes - amplitudes.mean(-1, keepdims=True)
-    g, w = np.exp(best.x[: single + pairs]), np.exp(best.x[single + pairs :])
-    tensors = {
-        "basis": basis,
-        "amplitudes": torch.from_numpy(amplitudes),
-        "decay": torch.from_numpy(g[:single].copy()),
-        "pair_decay": torch.from_numpy(g[single:].copy()),
-        "pair_frequency": torch.from_numpy(w.copy()),
-    }
-    return tensors, {
-        "converged": bool(best.success),
-        "misfit": float(np.sqrt(np.mean(misfit**2))),
-        "order": list(order),
-    }
+    found = {"decay": poles.decay, "pair_decay": poles.pair_decay, "pair_frequency": poles.pair_frequency}
+    return {
+        "basis": basis, "amplitudes": torch.from_numpy(amplitudes),
+        **{name: torch.from_numpy(value.copy()) for name, value in found.items()},
+    }  # fmt: skip
+
+
+def _stays(sample: Sample) -> Tensor:
+    """Pi of the model: none of the energy of damped chains."""
+    return torch.zeros_like(sample.mean[:, 0]) if sample.damped else exact_basis(sample)
+
+
+def _fit(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
+    basis, order = _stays(sample), recipe.settings.order
+    rates = torch.einsum("t,str->sr", linear_weights(sample.times, recipe.window), sample.mean)
+    with single_blas_thread():
+        tensors, report = fit_memory(
+            sample.times, sample.mean, basis, order, leading=sample.leading, progress=progress,
+            near=near if isinstance(near, MemoryModel) else None,
+        )  # fmt: skip
+    return MemoryModel(rates=rates, **tensors), report
+
+
+def replicas(transfer: BandTransfer, recipe: Recipe, model: MemoryModel, repeats: Tensor) -> Iterator[MemoryModel]:
+    """Models of ensembles in which the blocks are repeated as often as told, (replica, block), fitted anew.
+
+    A fit that starts at the model moves its rates little: it sees of the energies no more than their products with the
+    model's functions f_m, with t f_m, and with the functions of the slopes and of what stays. To these few rows every
+    block is reduced once, and each replica is fitted to a sum of rows.
+    """
+    sample, n = Sample.of(transfer), transfer.n_bands
+    poles = _poles(model)
+    times = sample.times.numpy()
+    wanted = np.concatenate([poles.functions(times), poles.slopes(times), np.ones((len(times), 1))], axis=1)
+    rows, _ = np.linalg.qr(wanted / np.linalg.norm(wanted, axis=0))
+    slope = linear_weights(sample.times, recipe.window)
+    seen = torch.cat([torch.from_numpy(rows.T.copy()), slope[None]])
+    every = (seen @ transfer.block_mean).flatten(1)  # [block, source * row * receiver]
+    late = transfer.block_long_time
+    basis = _stays(sample)
+    conserved = _conserved(sample.mean, basis)
+    ones, eye = rows.sum(0), np.eye(n).ravel()
+    for weight in block_weights(transfer, repeats):
+        kept = basis if sample.damped or late is None else torch.einsum("b,bsr->sr", weight, late)
+        values = (weight @ every).unflatten(0, (n, len(seen), n))
+        stays = kept.numpy().ravel()
+        data = values[:, :-1].transpose(0, 1).reshape(len(ones), -1).numpy() - np.outer(ones, stays)
+        small = Projection(times, data @ sample.leading, (eye - stays) @ sample.leading, rows.T)
+        with single_blas_thread():
+            moved, _, _ = small.polished(poles, REFIT_STEPS)
+            amplitudes, _, _ = Projection(times, data, eye - stays, rows.T).amplitudes(moved)
+        yield MemoryModel(rates=values[:, -1].clone(), **_tensors(kept, moved, amplitudes, conserved))
+
+
+REFIT_STEPS = 8
+"""Of the search for the rates of a replica: their spread, not their last digits, is wanted."""
+
+
+def _size(n_bands: int, damped: bool, settings: ProjectionSettings) -> int:
+    single, pairs = settings.order or ORDERS[0]
+    functions = single + 2 * pairs
+    return n_bands**2 * (functions - 1 + (not damped)) + functions
+
+
+def _rungs(n_times: int) -> list[ProjectionSettings]:
+    """The orders whose functions so many times can tell apart."""
+    found = [ProjectionSettings(order) for order in ORDERS if 2 * (order[0] + 2 * order[1]) <= n_times]
+    if not found:
+        raise checks.fail("transfer", "have at least 2 times for model 'memory'", f"{n_times}")
+    return found
+
+
+MEMORY = ReducedModel(
+    "memory", "any response, as a few decay rates shared by all pairs of bands", MemoryModel,
+    (Fit("projection", "variable projection on all times", _fit, settings=ProjectionSettings, report=ProjectionReport,
+         check=lambda settings, n_times: checked_order(settings.order, n_times)),),
+    _size, climbed_by="projection", default=True, needs_long_time=True, fits_loss=True, rungs=_rungs, replicas=replicas,
+)  # fmt: skip

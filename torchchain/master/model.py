@@ -1,8 +1,9 @@
-"""Rate models: how the energy of each band flows to the others, from the paper's (Q, Psi) upward (Eqs. 47-51)."""
+"""What every reduced model of the transfer between bands offers, and how a linear one is propagated."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -29,16 +30,28 @@ class Embedding:
 
 
 class TransferModel(nn.Module):
-    """What every model of the transfer between bands offers; energies are row vectors, e(t) = e(0) T(t)."""
+    """A model of the transfer T(t) between bands; energies are row vectors, e(t) = e(0) T(t).
 
-    kind: str
+    A kind of one's own needs ``kind``, ``axes``, the tensors named there as attributes and constructor arguments
+    ("basis" [source, receiver] and "damping" [band] among them), ``n_parameters``, and :meth:`embedding`.
+
+    Attributes:
+        kind: what its files call it.
+        axes: of each tensor that makes the model: "band", or any other word for an axis of any length.
+        rates_meaning: what :attr:`rates` are, in words.
+    """
+
+    kind: ClassVar[str]
+    axes: ClassVar[dict[str, tuple[str, ...]]]
+    rates_meaning: ClassVar[str] = "slope of the model's transfer at time 0"
     basis: Tensor
     damping: Tensor
 
     @property
     def rates(self) -> Tensor:
-        """Q [source, receiver], per unit time."""
-        raise NotImplementedError
+        """[source, receiver], per unit time; see ``rates_meaning``."""
+        parts = self.embedding()
+        return parts.start @ parts.generator @ parts.readout
 
     @property
     def n_bands(self) -> int:
@@ -51,12 +64,17 @@ class TransferModel(nn.Module):
 
     @property
     def conservation_defect(self) -> float:
-        """How far the model, without its damping, is from conserving energy; 0 where it does."""
-        raise NotImplementedError
+        """How far the model, without its damping, is from conserving energy, at times of order 1 where not told better."""
+        return float((self.transfer(torch.ones(1).to(self.basis)).detach().sum(-1) - 1).abs().max())
+
+    @property
+    def words(self) -> str:
+        """One phrase on the size of the model."""
+        return f"{self.n_parameters} fitted numbers"
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that makes the model, as its constructor takes it."""
-        raise NotImplementedError
+        return {name: getattr(self, name) for name in self.axes}
 
     def embedding(self) -> Embedding:
         """The model as a linear differential equation with constant coefficients."""
@@ -64,7 +82,7 @@ class TransferModel(nn.Module):
 
     def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
         """e(t) by the matrix exponential, (*batch, time, band), from initial (*batch, band)."""
-        raise NotImplementedError
+        return propagate_embedded(self.embedding(), initial, times)
 
     def transfer(self, times: Tensor) -> Tensor:
         """T(t), (source, time, receiver): the propagation of a unit energy in each band."""
@@ -92,120 +110,6 @@ def checked_damping(damping: Tensor | None, rates: Tensor) -> Tensor:
         raise checks.fail("damping", f"have shape {(len(rates),)} like the rates", f"shape {tuple(damping.shape)}")
     checks.first_bad("damping", "not be negative", damping, damping < 0, "band")
     return damping.to(rates)
-
-
-class RateModel(TransferModel):
-    """Transfer T(t) = Pi e^(-D t) + (I - Pi) exp((Q - D) t) between bands: e(t) = e(0) T(t), row vectors.
-
-    Of the energy that starts in band s the share Pi[s, r] stays in band r for good (the basis energy e0 of Eq. 48);
-    the rest moves with the rates Q and is conserved where the rows of Q sum to zero; D = diag(d) drains both (Eq. 51).
-    The paper's model has Pi = diag(Psi) (Eq. 47).
-
-    Args:
-        rates: Q [source, receiver], per unit time.
-        basis: Pi [source, receiver], or its diagonal [band].
-        damping: d [band], per unit time; None for no dissipation.
-
-    Raises:
-        FieldError: for a shape that does not fit, a value that is not finite, a basis row with a sum above 1.
-    """
-
-    kind = "markov"
-
-    def __init__(self, rates: Tensor, basis: Tensor, damping: Tensor | None = None) -> None:
-        super().__init__()
-        rates = checks.real_tensor("rates", rates)
-        basis = checked_basis(basis, rates)
-        self._rates = nn.Parameter(rates.detach().clone())
-        self.register_buffer("basis", basis.detach().clone())
-        self.register_buffer("damping", checked_damping(damping, rates).detach().clone())
-
-    @property
-    def rates(self) -> Tensor:
-        return self._rates
-
-    @property
-    def n_parameters(self) -> int:
-        """All of Q, and the basis where it is a matrix of its own."""
-        diagonal = torch.diag(self.basis.diagonal())
-        return self.n_bands**2 + (0 if torch.equal(diagonal, self.basis) else self.n_bands**2)
-
-    @property
-    def conservation_defect(self) -> float:
-        """Largest row sum of Q, per unit time."""
-        return float(self.rates.detach().sum(-1).abs().max())
-
-    def tensors(self) -> dict[str, Tensor]:
-        return {"rates": self.rates, "basis": self.basis, "damping": self.damping}
-
-    def embedding(self) -> Embedding:
-        """Free energy and basis energy side by side: (I - Pi, Pi) decaying by Q - D and -D."""
-        eye = torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device)
-        drain = torch.diag(self.damping)
-        return Embedding(
-            torch.cat([eye - self.basis, self.basis], dim=1),
-            torch.block_diag(self.rates - drain, -drain),
-            torch.cat([eye, eye]),
-        )
-
-    def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
-        resting = (initial @ self.basis)[..., None, :]
-        if bool(self.damping.any()):
-            resting = resting * torch.exp(-times[:, None] * self.damping)
-        flow = self.rates - torch.diag(self.damping)
-        return resting + flows(initial - initial @ self.basis, flow, times)
-
-
-class SwingInModel(RateModel):
-    """A :class:`RateModel` whose rates act on energy only some time after it came: the swing-in of Section 3.5.
-
-    Energy starts at rest, is released with the rate 1 / tau, and moves with the rates Q from then on: transfer begins
-    with t^2 rather than t, and late energies are those of a :class:`RateModel` a time tau earlier, which is the t0 of
-    the linear procedure. A chain of two states per band is still Markovian, conserves energy where Q does, and is
-    never negative where no rate between bands is. (In a generalized master equation, whose kernel here is not a
-    delta function; Nakajima 1958, Zwanzig 1960.)
-
-    Args:
-        rates, basis, damping: see :class:`RateModel`.
-        delay: tau, the mean time at rest, per source or one for all.
-    """
-
-    kind = "swing_in"
-
-    def __init__(self, rates: Tensor, basis: Tensor, delay: Tensor, damping: Tensor | None = None) -> None:
-        super().__init__(rates, basis, damping)
-        delay = checks.real_tensor("delay", delay).to(self.rates)
-        if delay.ndim > 1 or delay.numel() not in (1, self.n_bands):
-            raise checks.fail("delay", f"be a number or have shape ({self.n_bands},)", f"shape {tuple(delay.shape)}")
-        checks.first_bad("delay", "be positive", delay, delay <= 0, "band")
-        self.register_buffer("delay", delay.detach().clone().reshape(-1).expand(self.n_bands).contiguous())
-        self.delay: Tensor
-
-    @property
-    def n_parameters(self) -> int:
-        return super().n_parameters + len(self.delay.unique())
-
-    def tensors(self) -> dict[str, Tensor]:
-        return {**super().tensors(), "delay": self.delay}
-
-    def embedding(self) -> Embedding:
-        """Resting, moving and basis energy side by side."""
-        eye = torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device)
-        drain = torch.diag(self.damping)
-        return Embedding(
-            torch.cat([eye - self.basis, torch.zeros_like(eye), self.basis], dim=1),
-            torch.block_diag(swing_in_generator(self.rates, self.delay) - torch.block_diag(drain, drain), -drain),
-            torch.cat([eye, eye, eye]),
-        )
-
-    def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
-        return propagate_embedded(self.embedding(), initial, times)
-
-
-def swing_in_generator(rates: Tensor, delay: Tensor) -> Tensor:
-    """Resting energy is released into moving energy, which moves with the rates, (2 band, 2 band)."""
-    release = torch.diag((1 / delay).expand(len(rates)))
-    return torch.cat([torch.cat([-release, release], dim=1), torch.cat([torch.zeros_like(rates), rates], dim=1)], dim=0)
 
 
 def propagate_embedded(parts: Embedding, initial: Tensor, times: Tensor, supply: Tensor | None = None) -> Tensor:
@@ -277,3 +181,9 @@ def equal_steps(times: Tensor) -> list[tuple[float, int]]:
         stretches.append(((ticks[end] - ticks[begin]) / (end - begin), end - begin))
         begin = end
     return stretches
+
+
+def swing_in_generator(rates: Tensor, delay: Tensor) -> Tensor:
+    """Resting energy is released into moving energy, which moves with the rates, (2 band, 2 band)."""
+    release = torch.diag((1 / delay).expand(len(rates)))
+    return torch.cat([torch.cat([-release, release], dim=1), torch.cat([torch.zeros_like(rates), rates], dim=1)], dim=0)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State
 from torchchain.modes import phase
@@ -46,8 +47,10 @@ def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Te
     """
     displacement, velocity = (z[..., None, :] for z in modal_amplitudes(chain, state, modes))
     frequency = chain.align(modes.frequencies, state.displacement)[..., None, :]
-    moves = state.velocity.requires_grad or bool((state.velocity != 0).any())
-    displaced = state.displacement.requires_grad or bool((state.displacement != 0).any())
+    displaced, moves = (
+        field.requires_grad or checks.is_transformed(field) or checks.first(field != 0) is not None
+        for field in (state.displacement, state.velocity)
+    )
 
     def motion(times: Tensor) -> tuple[Tensor, Tensor]:
         t = times.to(state.displacement)[:, None]

@@ -93,16 +93,15 @@ def normal_modes(chain: Chain) -> NormalModes:
         raise DecompositionError(
             f"masses and stiffnesses must leave the eigen-solver finite numbers, got: {error}"
         ) from None
-    if symmetric.requires_grad:
+    if symmetric.requires_grad and not checks.is_transformed(symmetric):
         symmetric.register_hook(lambda gradient: _check_gradient(gradient, squared.detach()))
     return checked_modes(chain, vectors)
 
 
 def _check_gradient(gradient: Tensor, squared: Tensor) -> None:
     """An error where two modes of one frequency leave the eigenvectors without a derivative."""
-    bad = ~gradient.isfinite().all(-1).all(-1)
-    if bool(bad.any()):
-        where = tuple(int(i) for i in bad.nonzero()[0])
+    where = checks.first(~gradient.isfinite().all(-1).all(-1))
+    if where is not None:
         gap = squared[where].diff()
         lower = int(gap.argmin())
         raise DecompositionError(
@@ -117,9 +116,8 @@ def _warn_if_wide(squared: Tensor) -> None:
     eps = torch.finfo(squared.dtype).eps
     middle = squared.sort(-1).values[..., squared.shape[-1] // 2]  # of two modes the upper: the lower can be at rest
     ratio = squared.amax(-1) / middle
-    bad = eps * ratio > eps**0.5
-    if bool(bad.any()):
-        where = tuple(int(i) for i in bad.nonzero()[0])
+    where = checks.first(eps * ratio > eps**0.5)
+    if where is not None:
         warnings.warn(
             f"the highest squared frequency is {ratio[where].item():.1e} times the median{checks.position(where)}: rounding "
             f"leaves the other modes accurate to {eps * ratio[where].item():.1e} (method 'chebyshev' keeps more digits)",
@@ -131,41 +129,31 @@ def _warn_if_wide(squared: Tensor) -> None:
 def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
     """NormalModes from orthonormal eigenvectors of M^(-1/2) K M^(-1/2), ascending, after checking them."""
     weight = chain.masses.rsqrt()
-    stiffness = chain.contact_stiffness
-    if chain.boundary == "periodic":
+    if chain.is_free:
         # The zero mode is uniform; the others are made orthogonal to it, which the solver's error next to it is not.
         uniform = (chain.masses / chain.masses.sum(-1, keepdim=True)).sqrt()[..., None]
         others = vectors[..., 1:]
         others = others - uniform * (uniform.mT @ others)
         vectors = torch.cat([uniform, others], dim=-1)
-        shapes = vectors * weight[..., :, None]
-        elongation = shapes - shapes.roll(1, -2)
-    else:
-        shapes = vectors * weight[..., :, None]
-        elongation = torch.nn.functional.pad(shapes, (0, 0, 1, 1)).diff(dim=-2)
-    tension = stiffness[..., None] * elongation
-    squared = (tension * elongation).sum(-2)
-    force = tension.roll(-1, -2) - tension if chain.boundary == "periodic" else tension.diff(dim=-2)
-    residual = (
-        (force * weight[..., :, None] + squared[..., None, :] * shapes / weight[..., :, None])
-        .detach()
-        .abs()
-        .amax((-2, -1))
-    )
+    shapes = vectors * weight[..., :, None]
+    elongation = chain.elongation(shapes.mT)  # (*batch, mode, contact)
+    tension = chain.contact_stiffness[..., None, :] * elongation
+    squared = (tension * elongation).sum(-1)
+    force = chain.net(tension) * weight[..., None, :]
+    residual = (force + squared[..., :, None] * shapes.mT / weight[..., None, :]).detach().abs().amax((-2, -1))
     gram = (vectors.mT @ vectors).detach()
-    gram.diagonal(dim1=-2, dim2=-1).sub_(1)
+    gram = gram - torch.eye(chain.n_particles, dtype=gram.dtype, device=gram.device)
     orthogonality = gram.abs().amax((-2, -1))
     limit = 40 * torch.finfo(shapes.dtype).eps * chain.n_particles**0.5
-    bad = ~((residual <= limit * squared.detach().amax(-1)) & (orthogonality <= limit))
-    if bool(bad.any()):
-        where = tuple(int(i) for i in bad.nonzero()[0])
+    where = checks.first(~((residual <= limit * squared.detach().amax(-1)) & (orthogonality <= limit)))
+    if where is not None:
         raise DecompositionError(
             f"modes must satisfy the eigenvalue equation and orthogonality to {limit:.1e}, got residual "
             f"{residual[where].item():.1e} and orthogonality defect {orthogonality[where].item():.1e}"
             + checks.position(where)
         )
     _warn_if_wide(squared.detach())
-    if chain.boundary == "periodic":  # no square root of the zero mode: it has no derivative there
+    if chain.is_free:  # no square root of the zero mode: it has no derivative there
         frequencies = torch.cat([torch.zeros_like(squared[..., :1]), squared[..., 1:].sqrt()], dim=-1)
     else:
         frequencies = squared.sqrt()

@@ -6,13 +6,11 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy
-import scipy
 import torch
-import torchdiffeq
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
@@ -20,34 +18,24 @@ from torchchain import checks
 from torchchain._version import __version__
 from torchchain.ensemble.scene import Scene
 from torchchain.master.fits import checked_window
-from torchchain.master.memory import MemoryModel
-from torchchain.master.model import RateModel, SwingInModel, TransferModel
-from torchchain.master.trust import Uncertainty
+from torchchain.master.ladder import kinds, methods
+from torchchain.master.model import TransferModel
+from torchchain.master.report import Calibration, Report
+from torchchain.master.uncertainty import Uncertainty
 
 FORMAT = "torchchain-master-equation"
 FAMILY_FORMAT = "torchchain-master-family"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 CONVENTIONS = {
+    "version": 1,  # of their meaning: wording may change without it
     "axes": "rates, basis and their stderr [source, receiver]; damping, delay [band]; amplitudes [function, source, receiver]; stderr [source, time, receiver]",
     "markov": "e(t) = e(0) (basis exp(-damping t) + (1 - basis) exp((rates - damping) t)), row vectors",
     "swing_in": "like markov, but energy moves only after it was released from rest with the rate 1 / delay",
-    "memory": "e(t) = e(0) (basis + sum_m amplitudes[m] f_m(t)) exp(-damping t); f: exponentials, then cosine and sine of pairs",
+    "memory": "e(t) = e(0) (basis + sum_m amplitudes[m] f_m(t)) exp(-damping t); f: exponentials, then cosine and sine of pairs; rates are slopes at short times, which e(t) does not use",
     "bands": "n_bands equal bands of |k| in (0, pi]; tone n lies in band ceil(n / (n_particles / 2 / n_bands))",
     "units": "mean mass 1, linear contact stiffness 1; time: travel time of sound over one particle",
 }
 LARGEST_FILE = 2**28
-MODELS: dict[str, type[TransferModel]] = {kind.kind: kind for kind in (RateModel, SwingInModel, MemoryModel)}
-AXES: dict[str, dict[str, tuple[str, ...]]] = {
-    RateModel.kind: {"rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",)},
-    SwingInModel.kind: {
-        "rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",), "delay": ("band",),
-    },
-    MemoryModel.kind: {
-        "rates": ("band", "band"), "basis": ("band", "band"), "damping": ("band",),
-        "amplitudes": ("function", "band", "band"), "decay": ("function",),
-        "pair_decay": ("function",), "pair_frequency": ("function",),
-    },
-}  # fmt: skip
 ERROR_AXES = {
     "rates_stderr": ("band", "band"), "basis_stderr": ("band", "band"),
     "stderr_times": ("time",), "stderr": ("band", "time", "band"),
@@ -58,12 +46,13 @@ LONGEST_AXIS = 128
 MOST_MEMBERS = 64
 
 
-Member = tuple[TransferModel, dict[str, Any], Uncertainty | None]
-"""A model, its record of calibration, and its error bars."""
+Member = tuple[TransferModel, Calibration, Uncertainty | None]
+"""A model, how it was calibrated, and its error bars."""
 
 
-def save(model: TransferModel, record: Mapping[str, Any], uncertainty: Uncertainty | None, path: str | Path) -> None:
-    """Write model, record and error bars; the file appears whole or not at all."""
+def save(member: Member, path: str | Path) -> None:
+    """Write a model; the file appears whole or not at all."""
+    model, record, uncertainty = member
     _write(_described(model, record), _packed(model, uncertainty), path)
 
 
@@ -78,27 +67,25 @@ def save_family(members: Sequence[Member], path: str | Path) -> None:
     _write({"format": FAMILY_FORMAT, "format_version": FORMAT_VERSION, "members": headers}, tensors, path)
 
 
-def _described(model: TransferModel, record: Mapping[str, Any]) -> dict[str, Any]:
+def _described(model: TransferModel, record: Calibration) -> dict[str, Any]:
     """The header of a model."""
-    scene: Scene = record["scene"]
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "kind": model.kind,
         "n_bands": model.n_bands,
-        "strength": scene.disorder.strength,
-        "method": record["method"],
-        "model": record["model"],
-        "window": record["window"],
-        "scene": scene.to_dict(),
-        "report": record["report"],
+        "strength": record.strength,
+        "method": record.method,
+        "model": record.model,
+        "rates_meaning": model.rates_meaning,
+        "window": record.window,
+        "scene": None if record.scene is None else record.scene.to_dict(),
+        "provenance": record.provenance,
+        "report": record.report.to_dict(),
         "conventions": CONVENTIONS,
         "versions": {
             "torchchain": __version__,
-            "torch": torch.__version__,
-            "numpy": numpy.__version__,
-            "scipy": scipy.__version__,
-            "torchdiffeq": torchdiffeq.__version__,
+            **{name: version(name) for name in ("torch", "numpy", "scipy", "torchdiffeq")},
         },
     }
 
@@ -166,25 +153,21 @@ def _member(where: str, header: dict[str, Any], tensors: dict[str, torch.Tensor]
     try:
         errors = {name: tensors.pop(name) for name in ERROR_AXES if name in tensors}
         uncertainty = Uncertainty.from_tensors(**errors) if errors else None
-        model = MODELS[header["kind"]](**tensors)
-        scene = Scene.from_dict(header["scene"])
+        model = kinds()[header["kind"]](**tensors)
+        scene = None if header["scene"] is None else Scene.from_dict(header["scene"])
         window = None if header["window"] is None else checked_window(header["window"])
-        report = header["report"]
-        if report.get("horizon", "infinite") != "infinite":
-            checks.number("report.horizon", report["horizon"], at_least=0)
-        if "damping" in report and checks.real_tensor("report.damping", report["damping"]).shape != (scene.n_bands,):
-            raise checks.fail("report.damping", f"hold {scene.n_bands} numbers", report["damping"])
-        if "damping" in report and min(report["damping"]) < 0:
-            raise checks.fail("report.damping", "not be negative", report["damping"])
+        fit = methods().get(header["method"])
+        report = Report.from_dict(header["report"], None if fit is None else fit.report)
+        if report.loss is not None and len(report.loss.rates) != model.n_bands:
+            raise checks.fail("report.loss.rates", f"hold {model.n_bands} numbers", report.loss.rates)
     except (checks.FieldError, checks.FieldTypeError, TypeError) as error:
         raise checks.fail(where, "hold valid fields", f"{error}") from None
-    if scene.n_bands != model.n_bands or header["n_bands"] != model.n_bands:
-        raise checks.fail(
-            where, "have as many bands in its scene as in its rates", f"{scene.n_bands} and {model.n_bands}"
-        )
-    if header["strength"] != scene.disorder.strength:
+    bands = model.n_bands if scene is None else scene.n_bands
+    if bands != model.n_bands or header["n_bands"] != model.n_bands:
+        raise checks.fail(where, "have as many bands in its scene as in its rates", f"{bands} and {model.n_bands}")
+    record = Calibration(header["method"], header["model"], window, scene, report, header["provenance"])
+    if header["strength"] != record.strength:
         raise checks.fail(where, "state the strength of its scene", header["strength"])
-    record = {"method": header["method"], "model": header["model"], "window": window, "scene": scene, "report": report}
     return model, record, uncertainty
 
 
@@ -205,35 +188,38 @@ def _headers(where: str, metadata: Mapping[str, str], expected: str) -> list[dic
 
 
 def _check_version(where: str, header: Mapping[str, Any]) -> None:
-    version = header.get("format_version")
-    if version != FORMAT_VERSION or isinstance(version, bool):
-        raise checks.fail(where, f"have format version {FORMAT_VERSION}", version)
+    found = header.get("format_version")
+    if found != FORMAT_VERSION or isinstance(found, bool):
+        raise checks.fail(where, f"have format version {FORMAT_VERSION} (calibrate again for another)", found)
 
 
 def _header(where: str, header: Any) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise checks.fail(where, f"carry the format {FORMAT}", checks.shown(header))
     _check_version(where, header)
-    kinds: dict[str, tuple[type, ...]] = {
+    fields: dict[str, tuple[type, ...]] = {
         "kind": (str,),
         "n_bands": (int,),
-        "strength": (int, float),
+        "strength": (int, float, type(None)),
         "method": (str,),
         "model": (str,),
+        "rates_meaning": (str,),
         "window": (list, type(None)),
-        "scene": (dict,),
+        "scene": (dict, type(None)),
+        "provenance": (str,),
         "report": (dict,),
         "conventions": (dict,),
         "versions": (dict,),
     }
-    for name, types in kinds.items():
+    for name, types in fields.items():
         if name not in header or not isinstance(header[name], types) or isinstance(header[name], bool):
             raise checks.fail(
                 where, f"have a header field {name} of type {types[0].__name__}", header.get(name, "nothing")
             )
-    if header["conventions"] != CONVENTIONS:
-        raise checks.fail(where, "follow this version's conventions", checks.shown(header["conventions"]))
-    checks.choice(f"{where}: kind", header["kind"], MODELS)
+    if header["conventions"].get("version") != CONVENTIONS["version"]:
+        rule = f"follow version {CONVENTIONS['version']} of the conventions"
+        raise checks.fail(where, rule, checks.shown(header["conventions"].get("version", "none")))
+    checks.choice(f"{where}: kind", header["kind"], kinds())
     return header
 
 
@@ -255,7 +241,7 @@ def _tensors(where: str, file: Any, headers: Sequence[Mapping[str, Any]], form: 
 def _model_tensors(
     where: str, file: Any, header: Mapping[str, Any], prefix: str, names: set[str]
 ) -> dict[str, torch.Tensor]:
-    expected = AXES[header["kind"]]
+    expected = kinds()[header["kind"]].axes
     if any(prefix + name in names for name in ERROR_AXES):
         expected = expected | ERROR_AXES
     if names != {prefix + name for name in expected}:

@@ -1,4 +1,4 @@
-"""Whether a calibrated master equation can take the place of the chains of a scene, and how far off it is then."""
+"""A calibrated master equation in the place of the chains of a scene: whether it can stand in, and how far off it is then."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchchain.master.equation import MasterEquation
 PREDICTED = frozenset({"band_energy", "long_time_band_energy"})
 
 
-def gaps(master: MasterEquation, scene: Scene) -> list[str]:
+def missing(master: MasterEquation, scene: Scene) -> list[str]:
     """What the scene asks for beyond the calibration, in words; empty where the calibration covers it."""
     found = master.concerns(scene)
     other = [name for name in scene.observables if name not in PREDICTED]
@@ -46,9 +46,10 @@ def error(master: MasterEquation, scene: Scene) -> float | None:
     """
     if master.uncertainty is not None:
         return float(master.standard_error(starts(master, scene), scene.times).max())
-    held, halves = (master.calibration.report.get(name) for name in ("held_out_distance", "halves_distance"))
-    if not isinstance(held, float) or not isinstance(halves, float):
+    selection = None if master.calibration is None else master.calibration.report.selection
+    if selection is None or selection.held_out_distance is None or selection.halves_distance is None:
         return None
+    held, halves = selection.held_out_distance, selection.halves_distance
     return math.sqrt(max(0.0, held**2 - halves**2) + halves**2 / 4)
 
 
@@ -86,9 +87,9 @@ def _stand_in(scene: Scene, tolerance: float, artifact: str | Path | MasterEquat
     """
     checks.instance("artifact", artifact, str, Path, MasterEquation)
     master = artifact if isinstance(artifact, MasterEquation) else MasterEquation.load(artifact)
-    missing = gaps(master, scene)
-    if missing:
-        return [], [f"the master equation at hand does not cover the scene: {'; '.join(missing)}"]
+    beyond = missing(master, scene)
+    if beyond:
+        return [], [f"the master equation at hand does not cover the scene: {'; '.join(beyond)}"]
     expected = error(master, scene)
     if expected is None:
         return [], ["the master equation at hand covers the scene, but its calibration does not tell its error"]

@@ -8,36 +8,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torchdiffeq
 from torch import Tensor
 
 from torchchain import checks
 from torchchain.master.model import TransferModel, propagate_embedded
+from torchchain.odes import INTEGRATORS, IntegrationError, Integrator, member_norm
 
-ADAPTIVE = ("dopri8", "dopri5", "bosh3", "fehlberg2", "adaptive_heun")
-FIXED = ("euler", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams", "fixed_adams")
-ORDERS = {
-    "dopri8": 8, "dopri5": 5, "bosh3": 3, "fehlberg2": 2, "adaptive_heun": 2,
-    "euler": 1, "midpoint": 2, "heun2": 2, "heun3": 3, "rk4": 4,
-}  # fmt: skip
-STABILITY = {
-    "euler": 2.0, "midpoint": 2.0, "heun2": 2.0, "heun3": 2.5127453266, "rk4": 2.7852935634,
-    "explicit_adams": 0.3, "implicit_adams": 1.0, "fixed_adams": 1.0,
-}  # fmt: skip
-"""Largest |lambda| step that a fixed-step method takes here.
-
-For Runge-Kutta methods the edge on the negative real axis, where sum z^k / k! leaves [-1, 1]; 3/10 for the Adams-Bashforth
-method of four steps. The implicit Adams methods are stable to 3, but are solved by fixed-point iteration, which
-contracts by 3/8 |lambda| step: 1 keeps it fast.
-"""
 MOST_STEPS = 10**5
 """Steps from one output time to the next beyond which an adaptive method gives up; a fixed-step method, ten times that in all."""
 ADAMS_STEPS = 4
 ADAMS_ITERATIONS = 60
-
-
-class IntegrationError(RuntimeError):
-    """A solver could not reach the end of the time span."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +41,17 @@ def expm(model: TransferModel, initial: Tensor, times: Tensor, supply: Tensor | 
     return propagate_embedded(model.embedding(), initial, times, supply)
 
 
-def largest_over_members(error: Tensor) -> Tensor:
-    """Norm for error control: the root mean square of the worst member, not diluted by the rest of the batch."""
-    return error.reshape(-1, error.shape[-1]).square().mean(-1).sqrt().max()
+def stability_limit(integrator: Integrator) -> float:
+    """Largest |lambda| step that is taken here: the edge of stability on the negative real axis, and for the implicit
+    Adams methods, whose fixed-point iteration contracts by 3/8 |lambda| step, 1 to keep it fast."""  # fmt: skip
+    assert integrator.decay_limit is not None, "adaptive methods choose their steps"
+    return 1.0 if integrator.order is None else integrator.decay_limit
 
 
-def _ode(method: str) -> Callable[..., Tensor]:
-    adaptive, scipy = method in ADAPTIVE, method == "scipy_solver"
-    fine = ORDERS.get(method, 5) >= 5  # a low order takes minutes to reach what a high one does in milliseconds
+def _ode(integrator: Integrator) -> Callable[..., Tensor]:
+    method, scipy = integrator.name, integrator.name == "scipy_solver"
+    adaptive = integrator.adaptive and not scipy
+    fine = (integrator.order or 5) >= 5  # a low order takes minutes to reach what a high one does in milliseconds
 
     def run(
         model: TransferModel,
@@ -80,6 +63,8 @@ def _ode(method: str) -> Callable[..., Tensor]:
         step: float | None = None,
         solver: str = "LSODA",
     ) -> Tensor:
+        import torchdiffeq  # takes a second or two, which most users never need
+
         parts = model.embedding()
         start = initial @ parts.start
         # A tolerance below rounding is never met: steps shrink until rounding, which grows with them, is all there is.
@@ -92,10 +77,13 @@ def _ode(method: str) -> Callable[..., Tensor]:
         if scipy:
             options = {"solver": checks.choice("solver", solver, ("RK45", "RK23", "DOP853", "Radau", "BDF", "LSODA"))}
         elif adaptive:  # steps end at the output times: between them the solution is known to a lower order only
-            options = {"norm": largest_over_members, "max_num_steps": MOST_STEPS}
+            options = {"norm": member_norm, "max_num_steps": MOST_STEPS}
         else:
             # Between steps by cubics: torchdiffeq's straight lines would make every method one of second order.
-            options = {"step_size": _checked_step(method, parts.generator, step, float(times[-1])), "interp": "cubic"}
+            options = {
+                "step_size": _checked_step(integrator, parts.generator, step, float(times[-1])),
+                "interp": "cubic",
+            }
             if method.endswith("adams"):
                 options |= {"max_order": ADAMS_STEPS, "max_iters": ADAMS_ITERATIONS}
 
@@ -129,11 +117,11 @@ def _ode(method: str) -> Callable[..., Tensor]:
     return run
 
 
-def _checked_step(method: str, generator: Tensor, step: float | None, end: float) -> float:
+def _checked_step(integrator: Integrator, generator: Tensor, step: float | None, end: float) -> float:
     """The step to use, given or half the stability limit: stable, and not too many of them."""
     fastest = float(torch.linalg.eigvals(generator.detach()).abs().max())
-    reach = STABILITY[method]
-    limit = reach / fastest if fastest > 0 else float("inf")
+    edge, method = stability_limit(integrator), integrator.name
+    limit = edge / fastest if fastest > 0 else float("inf")
     step = min(limit / 2, 1.0) if step is None else checks.number("step", step, above=0)
     if end / step > 10 * MOST_STEPS:
         raise checks.fail(
@@ -142,22 +130,26 @@ def _checked_step(method: str, generator: Tensor, step: float | None, end: float
     if step > limit * (1 + 1e-9):
         raise checks.fail(
             "step",
-            f"be at most {limit:.6g} for '{method}' (|lambda| step <= {reach:.4g}, fastest rate {fastest:.4g})",
+            f"be at most {limit:.6g} for '{method}' (|lambda| step <= {edge:.4g}, fastest rate {fastest:.4g})",
             step,
         )
     return step
 
 
+def _solver(integrator: Integrator) -> Solver:
+    name = integrator.name
+    if name == "scipy_solver":
+        return Solver(name, _ode(integrator), "torchdiffeq, SciPy's solvers", ("rtol", "atol", "solver"))
+    if integrator.adaptive:
+        return Solver(name, _ode(integrator), "torchdiffeq, adaptive step", ("rtol", "atol"))
+    options = ("step", "rtol", "atol") if name.endswith("adams") else ("step",)
+    return Solver(name, _ode(integrator), "torchdiffeq, fixed step", options)
+
+
+STABILITY = {entry.name: stability_limit(entry) for entry in INTEGRATORS.values() if not entry.adaptive}
+"""Largest |lambda| step of every method with a fixed step."""
+
 SOLVERS: dict[str, Solver] = {
     "expm": Solver("expm", expm, "matrix exponential, exact"),
-    **{name: Solver(name, _ode(name), "torchdiffeq, adaptive step", ("rtol", "atol")) for name in ADAPTIVE},
-    **{
-        name: Solver(
-            name, _ode(name), "torchdiffeq, fixed step", ("step", "rtol", "atol") if "adams" in name else ("step",)
-        )
-        for name in FIXED
-    },
-    "scipy_solver": Solver(
-        "scipy_solver", _ode("scipy_solver"), "torchdiffeq, SciPy's solvers", ("rtol", "atol", "solver")
-    ),
+    **{name: _solver(integrator) for name, integrator in INTEGRATORS.items()},
 }

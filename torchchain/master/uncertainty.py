@@ -1,4 +1,4 @@
-"""How far a calibrated model can be trusted: error bars by block bootstrap, and the horizon of its predictions.
+"""Error bars of a calibrated model by block bootstrap, and the last time up to which it was compared with chains.
 
 The error of a predicted energy has two parts. The ensemble is finite: blocks of realizations are drawn again with
 replacement and the model is fitted again (Efron 1979; Kunsch 1989). And the model is not the chain: where it misses
@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +21,9 @@ from torchchain import checks
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import FitWarning
-from torchchain.master.ladder import Recipe, Sample, fit
 from torchchain.master.model import TransferModel
+from torchchain.master.records import Progress, Recipe
+from torchchain.master.sample import Sample
 
 MOST_TIMES = 64
 """Times at which the errors of predictions are kept."""
@@ -64,6 +64,19 @@ class Uncertainty:
         size = initial.abs().amax(-1, keepdim=True).clamp(min=torch.finfo(initial.dtype).tiny)
         return torch.einsum("...s,str->...tr", (initial / size).square(), here.square()).sqrt() * size[..., None]
 
+    def coarsened(self, joined: Tensor) -> Uncertainty:
+        """Of wider bands, which ``joined`` (band, wider band) makes of the present ones.
+
+        Errors of sources are independent, as in :meth:`of`. Those of receivers may be the same error of the model, and
+        add up: the standard errors are upper bounds.
+        """
+        mean = (joined / joined.sum(0)).T.square()
+
+        def wider(error: Tensor) -> Tensor:
+            return torch.tensordot(mean, (error @ joined).square(), dims=1).sqrt()
+
+        return Uncertainty(wider(self.rates_stderr), wider(self.basis_stderr), self.times, wider(self.stderr))
+
     def tensors(self) -> dict[str, Tensor]:
         return {
             "rates_stderr": self.rates_stderr, "basis_stderr": self.basis_stderr,
@@ -93,12 +106,8 @@ class Uncertainty:
         return cls(rates_stderr, basis_stderr, stderr_times, stderr)
 
 
-def bootstrap(
-    transfer: BandTransfer,
-    recipe: Recipe,
-    model: TransferModel,
-    replicates: int,
-    progress: Callable[[int], Any] | None = None,
+def draw_again(
+    transfer: BandTransfer, recipe: Recipe, model: TransferModel, replicates: int, progress: Progress = None
 ) -> Uncertainty:
     """Fit the same recipe to ``replicates`` ensembles of blocks drawn with replacement.
 
@@ -106,21 +115,18 @@ def bootstrap(
 
     Args:
         transfer: what the model was fitted to, of at least two blocks.
-        recipe: with model, method and order.
+        recipe: with nothing left to be chosen.
         model: fitted to the whole transfer.
         replicates: how many, at least 2.
         progress: called with 1 after every replicate.
     """
     blocks = len(transfer.block_counts)
     draws = np.random.Generator(np.random.Philox(key=np.array([blocks, replicates], dtype=np.uint64)))
+    drawn = [np.bincount(draws.integers(0, blocks, blocks), minlength=blocks) for _ in range(replicates)]
     kept = _kept(len(transfer.times))
     times = transfer.times[kept]
     rates, bases, paths = [], [], []
-    for _ in range(replicates):
-        repeats = np.bincount(draws.integers(0, blocks, blocks), minlength=blocks)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FitWarning)
-            other, _ = fit(Sample.of_blocks(transfer, torch.from_numpy(repeats)), recipe, near=model)
+    for other in _replicas(transfer, recipe, model, torch.from_numpy(np.stack(drawn))):
         rates.append(other.rates.detach())
         bases.append(other.basis)
         paths.append(other.transfer(times).detach())
@@ -135,6 +141,18 @@ def bootstrap(
     return Uncertainty(
         scale * torch.stack(rates).std(0), scale * torch.stack(bases).std(0), times, (spread.square() + own).sqrt()
     )
+
+
+def _replicas(transfer: BandTransfer, recipe: Recipe, model: TransferModel, repeats: Tensor) -> Iterator[TransferModel]:
+    """The models of ensembles in which blocks are repeated, (replica, block): the record's own way, or fitted anew."""
+    if recipe.model is not None and recipe.model.replicas is not None:
+        yield from recipe.model.replicas(transfer, recipe, model, repeats)
+        return
+    for repeat in repeats:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FitWarning)
+            other, _ = recipe.run(Sample.of_blocks(transfer, repeat), model)
+        yield other
 
 
 def _kept(count: int) -> Tensor:
@@ -158,11 +176,14 @@ def horizon(transfer: BandTransfer, model: TransferModel) -> float:
     of two such ensembles.
     """
     end = float(transfer.times[-1])
-    if transfer.long_time is None or end == 0 or transfer.scene.damping > 0:
+    if transfer.long_time is None or end == 0 or transfer.damping > 0:
         return end
     late = transfer.times > 0.75 * end
     noise = 2 * float(statistical_distance(transfer.stderr[:, late]).mean())
     settled = float(total_variation(transfer.mean[:, late], transfer.long_time[:, None]).mean())
     latest = torch.tensor([end, 100 * end], dtype=transfer.times.dtype)
-    ahead = float(total_variation(model.transfer(latest)[:, -1].detach(), transfer.long_time).mean())
+    foreseen = model.transfer(latest)[:, -1].detach()
+    if not bool(foreseen.isfinite().all()):
+        return end
+    ahead = float(total_variation(foreseen, transfer.long_time).mean())
     return math.inf if settled <= noise and ahead <= noise else end

@@ -1,0 +1,21 @@
+"""The names that help lists, spelled out so that it answers without torch; a test compares them with the registries."""
+
+KINDS = ("normal", "uniform", "binary", "lognormal", "gamma")
+EXCITATIONS = ("impulse", "standing_wave")
+BOUNDARIES = ("periodic", "fixed")
+CONTACTS = ("linear", "hertz", "auto")
+DEFINITIONS = ("site", "bond")
+OBSERVABLES = (
+    "band_energy", "center", "displacement", "dissipated", "energy", "long_time_band_energy", "openings",
+    "source_energy", "total_energy", "wavenumber_energy", "width",
+)  # fmt: skip
+METHODS = (
+    "modes", "tridiagonal", "chebyshev", "verlet", "symplectic4", "damped", "dopri5", "dopri8", "bosh3",
+    "adaptive_heun", "fehlberg2", "lsoda", "midpoint", "heun2", "heun3", "rk4", "explicit_adams", "implicit_adams",
+)  # fmt: skip
+SOLVERS = (
+    "expm", "dopri8", "dopri5", "bosh3", "fehlberg2", "adaptive_heun", "euler", "midpoint", "heun2", "heun3", "rk4",
+    "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver",
+)  # fmt: skip
+FITS = ("analytic", "linear", "nonlinear", "adam", "projection")
+MODELS = ("paper", "exact_psi", "basis_matrix", "swing_in", "memory")

@@ -1,0 +1,232 @@
+"""``torchchain sweep``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import math
+import time
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tomli_w
+
+from torchchain import checks, plots
+from torchchain.cli import outputs
+from torchchain.cli.calibrate import run_calibrate
+from torchchain.cli.flags import Calibrate, Simulate, Sweep
+from torchchain.cli.runs import config_of
+from torchchain.cli.simulate import run_simulate
+from torchchain.ensemble.ranks import rank_of_environment
+from torchchain.ensemble.scene import Scene
+from torchchain.progress import log
+from torchchain.results import RunFolder
+
+if TYPE_CHECKING:
+    import xarray
+
+MOST_RUNS = 10_000
+MOST_PANELS = 6
+
+
+@dataclass(frozen=True)
+class Point:
+    """One run of a sweep: its folder's name, the values of the swept fields, and the whole config."""
+
+    name: str
+    values: tuple[Any, ...]
+    config: dict[str, Any]
+
+
+def run_sweep(flags: Sweep, arguments: list[str]) -> None:
+    """Run every combination that has not been run, then leave all results in one file, a table and a figure."""
+    began = time.time()
+    checks.choice("command", flags.command, ("simulate", "calibrate"))
+    config, loaded = config_of(flags.config, flags.plugin)
+    if flags.seed is not None:
+        config["seed"] = flags.seed
+    if loaded:
+        config["plugins"] = loaded
+    fields = swept(flags.fields)
+    points = list(combinations(fields, config))
+    for point in points:  # all of them before the first is run
+        tables = ("plugins", *(["calibration"] if flags.command == "calibrate" else []))
+        Scene.from_dict({name: value for name, value in point.config.items() if name not in tables})
+    with outputs.run_folder(flags.out) as out:
+        for number, point in enumerate(points, 1):
+            folder, text = out / "runs" / point.name, tomli_w.dumps(point.config)
+            if _done(folder, text):
+                continue
+            log.info("run %d of %d: %s", number, len(points), point.name)
+            request = folder.parent / f"{point.name}.toml"
+            if rank_of_environment() == 0:
+                outputs.write(folder.parent, {request.name: outputs.text(text)})
+            how: dict[str, Any] = {
+                "config": str(request),
+                "out": str(folder),
+                "device": flags.device,
+                "threads": flags.threads,
+            }
+            with redirect_stdout(io.StringIO()):
+                again = [flags.command, "--config", str(request), "--out", str(folder)]
+                if flags.command == "simulate":
+                    run_simulate(Simulate(**how), again)
+                else:
+                    run_calibrate(Calibrate(**how), again)
+        if rank_of_environment():
+            return
+        folders = [RunFolder(out / "runs" / point.name) for point in points]
+        rows = [_row(folder.record) for folder in folders]
+        data = combined(fields, [folder.data for folder in folders], rows)
+        text = tomli_w.dumps({**config, "sweep": {name: list(values) for name, values in fields.items()}})
+        record = outputs.run_record(
+            arguments, text, flags.device, began, {}, seed=config.get("seed", 0), runs=[point.name for point in points]
+        )
+        outputs.write(out, {
+            "config.toml": outputs.text(text), "sweep.nc": outputs.dataset(data),
+            "sweep.csv": outputs.text(_table(fields, points, rows)), "figure.png": outputs.figure(_figure(fields, data)),
+            outputs.RECORD: record,
+        })  # fmt: skip
+    print(
+        f"{len(points)} runs of {flags.command} over {', '.join(fields)}; {time.time() - began:.1f} s, results in {flags.out}"
+    )
+
+
+def swept(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+    """Fields and their values, from words like ``disorder.strength=0.1,0.3``."""
+    if not words:
+        raise checks.fail("fields", "be at least one field=value,value", "none")
+    fields: dict[str, tuple[Any, ...]] = {}
+    for word in words:
+        name, sign, values = word.partition("=")
+        if not sign or not name or not values:
+            raise checks.fail("fields", "read field=value,value", repr(word))
+        if name in fields:
+            raise checks.fail("fields", "be named once", name)
+        fields[name] = tuple(_value(text) for text in values.split(","))
+        if len({json.dumps(value) for value in fields[name]}) < len(fields[name]):
+            raise checks.fail(name, "have different values", values)
+    runs = math.prod(map(len, fields.values()))
+    if runs > MOST_RUNS:
+        raise checks.fail("fields", f"make at most {MOST_RUNS} runs", runs)
+    return fields
+
+
+def _value(text: str) -> Any:
+    """A TOML value, or a bare word."""
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+    return value if isinstance(value, (bool, int, float, str)) else text
+
+
+def combinations(fields: Mapping[str, Sequence[Any]], config: Mapping[str, Any]) -> Iterator[Point]:
+    """Every combination, the last field fastest."""
+    for values in itertools.product(*fields.values()):
+        whole: dict[str, Any] = json.loads(json.dumps(config))
+        for name, value in zip(fields, values, strict=True):
+            *tables, last = name.split(".")
+            table = whole
+            for key in tables:
+                if not isinstance(table.setdefault(key, _default(key)), dict):
+                    raise checks.fail(name, "name a field of the scene file", checks.shown(table[key]))
+                table = table[key]
+            table[last] = value
+        yield Point(",".join(f"{n}={v}" for n, v in zip(fields, values, strict=True)).replace("/", "_"), values, whole)
+
+
+def _default(table: str) -> dict[str, Any]:
+    """What a table that the file does not have holds: the command's own default for the times."""
+    return {"start": 0.0, "stop": 50.0, "step": 0.25} if table == "times" else {}
+
+
+def _done(folder: Path, text: str) -> bool:
+    """Whether a finished run of this very config lies in the folder."""
+    request = folder.parent / f"{folder.name}.toml"
+    return (folder / outputs.RECORD).is_file() and request.is_file() and request.read_text(encoding="utf-8") == text
+
+
+def _row(record: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers that sum a run up."""
+    found: dict[str, float] = {}
+    for part in ({"seconds": record.get("seconds")}, record.get("realized") or {}, record.get("summary") or {}):
+        found |= {k: float(v) for k, v in part.items() if isinstance(v, (int, float)) and not isinstance(v, bool)}
+    return found
+
+
+def combined(
+    fields: Mapping[str, Sequence[Any]], results: Sequence[xarray.Dataset], rows: Sequence[Mapping[str, float]]
+) -> xarray.Dataset:
+    """All results in one dataset whose leading axes are the swept fields.
+
+    Variables whose axes differ between the runs (other bands, other particles) are left out, and named in the attribute
+    ``left_out``.
+    """
+    import xarray
+
+    shape = tuple(map(len, fields.values()))
+    variables: dict[str, Any] = {}
+    coords: dict[str, Any] = {name: list(values) for name, values in fields.items()}
+    left_out = []
+    first = results[0]
+    for name, values in first.data_vars.items():
+        if str(name).startswith("block"):
+            continue
+        alike = all(
+            name in other and other[name].dims == values.dims and other[name].shape == values.shape
+            and all(np.array_equal(other[axis].values, values[axis].values) for axis in values.coords)
+            for other in results
+        )  # fmt: skip
+        if not alike:
+            left_out.append(str(name))
+            continue
+        stacked = np.stack([other[name].values for other in results]).reshape(*shape, *values.shape)
+        variables[str(name)] = ((*fields, *values.dims), stacked, values.attrs)
+        coords |= {str(axis): values[axis] for axis in values.coords}
+    for name in sorted(set.intersection(*(set(row) for row in rows))):
+        variables[f"run_{name}"] = (tuple(fields), np.array([row[name] for row in rows]).reshape(shape))
+    return xarray.Dataset(variables, coords, {"left_out": ", ".join(left_out)})
+
+
+def _table(fields: Mapping[str, Any], points: Sequence[Point], rows: Sequence[Mapping[str, float]]) -> str:
+    """The runs as comma-separated values: swept fields, then the numbers that sum them up."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*fields, *names])
+    for point, row in zip(points, rows, strict=True):
+        writer.writerow([*point.values, *(row.get(name, "") for name in names)])
+    return text.getvalue()
+
+
+def _figure(fields: Mapping[str, Sequence[Any]], data: xarray.Dataset) -> Any:
+    """The numbers that sum the runs up over the first field, one line for each combination of the others."""
+    names = [str(name) for name in data.data_vars if str(name).startswith("run_")][:MOST_PANELS]
+    columns = min(3, len(names))
+    figure, axes = plots.figure(
+        4.2 * columns, 3.2 * math.ceil(len(names) / columns), math.ceil(len(names) / columns), columns
+    )
+    first, *others = fields
+    numeric = all(isinstance(value, (int, float)) for value in fields[first])
+    x = fields[first] if numeric else range(len(fields[first]))
+    for ax, name in zip(axes.flat, names, strict=False):
+        for chosen in itertools.product(*(range(len(fields[other])) for other in others)):
+            line = data[name].isel(dict(zip(others, chosen, strict=True)))
+            label = ", ".join(f"{other} = {fields[other][i]}" for other, i in zip(others, chosen, strict=True))
+            ax.plot(x, line.values, "o-", ms=3, label=label or None)
+        ax.set(xlabel=first, ylabel=name.removeprefix("run_").replace("_", " "))
+        if not numeric:
+            ax.set_xticks(list(x), [str(value) for value in fields[first]])
+    if others and names:
+        axes.flat[0].legend(fontsize="x-small")
+    for ax in list(axes.flat)[len(names) :]:
+        ax.set_axis_off()
+    return figure

@@ -1,0 +1,105 @@
+"""The transfer between bands from runs whose starts are spread over several bands: impulses, packets, random states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+
+LARGEST_CONDITION = 1e3
+"""Of the least-squares problem; noise in the energies grows by up to this factor in the transfer."""
+MOST_BLOCKS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class FittedTransfer:
+    """Transfer T of the runs E(run, t) = sum_s x(run, s) T(s, t), by least squares.
+
+    Attributes:
+        mean: T [source, time, receiver].
+        stderr: its standard error, from leaving out one block of realizations at a time.
+        block_mean: pseudo-values of the blocks [block, source, time, receiver], whose mean is near ``mean``.
+        block_counts: realizations of each block.
+        condition: ratio of the largest and the smallest singular value of the starts x, each source scaled to unit size.
+    """
+
+    mean: Tensor
+    stderr: Tensor
+    block_mean: Tensor
+    block_counts: tuple[int, ...]
+    condition: float
+
+
+def fit_transfer(starts: Tensor, energies: Tensor, realization: Tensor) -> FittedTransfer:
+    """The transfer that explains the energies of all runs best.
+
+    Energies of bands add up over the bands of the start where the waves in them are not correlated, which disorder and
+    random phases see to (and T is defined by). Rows of T sum to one where those of the runs do.
+
+    Args:
+        starts: x, energy of every band at time 0, (run, band).
+        energies: energy of every band at every time, (run, time, band).
+        realization: number of the chain of every run, (run,); runs of one chain are not independent.
+
+    Returns:
+        FittedTransfer.
+
+    Raises:
+        FieldError: if the starts leave a band without energy, or do not tell the bands apart.
+    """
+    starts = checks.real_tensor("starts", starts).double()
+    energies = checks.real_tensor("energies", energies).double()
+    if starts.ndim != 2 or energies.ndim != 3 or len(starts) != len(energies) or starts.shape[1] != energies.shape[2]:
+        raise checks.fail(
+            "energies",
+            f"have shape (run, time, band) that fits starts {tuple(starts.shape)}",
+            f"shape {tuple(energies.shape)}",
+        )
+    condition = condition_of(starts)
+    chains = torch.unique(realization)
+    blocks = min(MOST_BLOCKS, len(chains))
+    mean = _solved(starts, energies)
+    if blocks < 2:
+        infinite = torch.full_like(mean, torch.inf)
+        return FittedTransfer(mean, infinite, mean[None], (len(chains),), condition)
+    parts = chains.tensor_split(blocks)
+    left_out = []
+    for part in parts:
+        kept = ~torch.isin(realization, part)
+        condition_of(starts[kept])  # an error where one block alone excites some band
+        left_out.append(_solved(starts[kept], energies[kept]))
+    replicates = torch.stack(left_out)
+    spread = (replicates - replicates.mean(0)).square().sum(0)
+    stderr = (spread * (blocks - 1) / blocks).sqrt()
+    pseudo = blocks * mean - (blocks - 1) * replicates
+    return FittedTransfer(mean, stderr, pseudo, tuple(len(part) for part in parts), condition)
+
+
+def condition_of(starts: Tensor) -> float:
+    """Condition number of the least-squares problem for starts (run, band), each band scaled to unit size.
+
+    Raises:
+        FieldError: if it is hopeless, naming the band that has least energy or the condition.
+    """
+    sizes = starts.norm(dim=0)
+    weakest = int(sizes.argmin())
+    if not float(sizes[weakest]) > 1e-6 * float(sizes.max()):
+        raise checks.fail("starts", "excite every band in some run", f"none in band {weakest + 1}")
+    singular = torch.linalg.svdvals(starts / sizes)
+    if len(starts) < starts.shape[1] or not float(singular[-1]) * LARGEST_CONDITION > float(singular[0]):
+        condition = "infinite" if len(starts) < starts.shape[1] else f"{float(singular[0] / singular[-1]):.3g}"
+        raise checks.fail(
+            "starts",
+            f"tell the {starts.shape[1]} bands apart (a condition number of at most {LARGEST_CONDITION:g})",
+            f"{condition} with {len(starts)} runs",
+        )
+    return float(singular[0] / singular[-1])
+
+
+def _solved(starts: Tensor, energies: Tensor) -> Tensor:
+    flat = energies.reshape(len(energies), -1)
+    solution = torch.linalg.lstsq(starts, flat, driver="gelsd").solution
+    return solution.reshape(starts.shape[1], *energies.shape[1:])
