@@ -257,7 +257,9 @@ def runs(folder: Path, config: Config, law: str, realization: int) -> list[tuple
         frames = read_frames(folder / f"{law}-{realization}-{s}.dump.gz")
         chain = frames.chain("periodic", contact="hertz" if law == "hertz" else "linear")
         reference = folder / f"{law}-{realization}.reference.dump.gz"
-        found.append((frames, chain, frames.trajectory(reference, chain=chain)))
+        path = frames.trajectory(reference, axis="x", chain=chain)
+        assert isinstance(path, tc.Trajectory)
+        found.append((frames, chain, path))
     return found
 
 
@@ -290,29 +292,17 @@ def long_time_shares(imported: Sequence[Sequence[tuple[Frames, tc.Chain, tc.Traj
     return torch.stack(found)
 
 
-def transfer_of(scene: tc.Scene, times: Tensor, energies: Tensor, late: Tensor) -> tc.BandTransfer:
-    """The band transfer of energies (realization, source, time, receiver) with their long-time averages."""
-    count = len(energies)
-    blocks = torch.arange(count).tensor_split(min(10, count))
-    error = math.sqrt(count)
-    return tc.BandTransfer(
-        scene, times, energies.mean(0), energies.std(0) / error, late.mean(0), late.std(0) / error,
-        torch.stack([energies[block].mean(0) for block in blocks]), torch.stack([late[block].mean(0) for block in blocks]),
-        tuple(len(block) for block in blocks),
-    )  # fmt: skip
-
-
 def scored(scene: tc.Scene, times: Tensor, energies: Tensor, late: Tensor) -> dict[str, float]:
     """Calibrated on the first half of the realizations, scored on the second.
 
     Total variation, a mean over sources and times: of the master equation to the fresh chains, and of the two halves.
     """
     half = len(energies) // 2
-    scene = replace(scene, times=times, realizations=half)
-    seen = transfer_of(scene, times, energies[:half], late[:half])
+    seen = tc.BandTransfer.from_energies(times, energies[:half], late[:half], provenance="LAMMPS, harmonic bonds")
+    seen = replace(seen, scene=replace(scene, times=times, realizations=half))
     fresh = energies[half : 2 * half].mean(0)
     master = tc.calibrate(seen)
-    predicted = master.solve(torch.eye(scene.n_bands, dtype=torch.float64), times)
+    predicted = master.solve(torch.eye(seen.n_bands, dtype=torch.float64), times)
     return {
         "master_distance": float(tc.total_variation(predicted, fresh).mean()),
         "halves_distance": float(tc.total_variation(seen.mean, fresh).mean()),

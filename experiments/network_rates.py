@@ -136,7 +136,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             "unknowns": ("case", unknowns),
             "name": ("case", names),
             "long_seconds": took,
-            "long_unknowns": network.n_unknowns,
+            "long_unknowns": long.n_unknowns,
             "long_energy_error": abs(energy / start - 1),
             "peak_gigabytes": peak,
         },

@@ -239,10 +239,10 @@ def _draw_edges(ax: Axes, data: xarray.Dataset, config: Config) -> None:
     ax.set(
         xlabel="disorder $\\xi$",
         ylabel="mean total variation from chains",
-        ylim=(0, None),
+        ylim=(0, 1.7 * float(data.late_error.max())),
         title="where the theory fails",
     )
-    ax.legend(fontsize=8)
+    ax.legend(fontsize=8, loc="upper left", ncols=2)
 
 
 def _mean_error(data: xarray.Dataset, config: Config) -> np.ndarray:

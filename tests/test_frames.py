@@ -716,9 +716,7 @@ def test_a_mean_mass_far_from_one(motion, file):
 def test_energy_that_drifts(motion, file):
     chain, path = motion
     frames = read_frames(file(dump(chain, path)))
-    still = file(
-        dump(chain, replace(path, times=path.times[:1], displacement=0 * path.displacement, velocity=0 * path.velocity))
-    )
+    still = file(dump(chain, tc.Trajectory(path.times[:1], 0 * path.displacement[:1], 0 * path.velocity[:1])))
     frames.trajectory(still, chain=chain)
     slower = torch.exp(-0.05 * path.times)[:, None]
     damped = replace(path, displacement=path.displacement * slower, velocity=path.velocity * slower)

@@ -135,6 +135,20 @@ def test_energy_momentum_and_reciprocity_of_a_large_lattice():
     assert u[0, 900, 1].abs() > 1e-6
 
 
+def test_a_bound_that_is_too_small_is_refused():
+    network = disordered("triangular")
+    state = random_state(network)
+    top = nw.normal_modes(network).frequencies[:, -1].square()
+    tight = nw.evolve(network, state, TIMES, "chebyshev", bound=top * (1 + 1e-9))
+    assert far(tight, nw.evolve(network, state, TIMES)) < 1e-10
+    with pytest.raises(FieldError, match=r"bound must not lie below the largest squared frequency .* at network 2"):
+        nw.evolve(network, state, TIMES, "chebyshev", bound=top * torch.tensor([1.1, 0.999]))
+    with pytest.raises(FieldError, match="times must be at most"):
+        nw.evolve(network, state, [1e12], "chebyshev")
+    with pytest.raises(FieldError, match="rounding in float64 has blurred the phases"):
+        nw.evolve(network, state, [1e15])
+
+
 def test_gradients_of_masses_stiffness_and_positions():
     base = nw.lattice("triangular", (3, 3), boundary="fixed")
     state = random_state(base, ())

@@ -104,7 +104,12 @@ def highest_frequency(chain: Chain, bound: float | Tensor | None = None) -> Tens
         )
         if checks.is_transformed(squared):  # one bound for all that vmap runs at once
             squared = checks.traced_values(squared).amax().expand(chain.batch_shape)
-        return torch.as_tensor(_rounded_up(checks.traced_values(squared.sqrt().cpu()).numpy()), device=squared.device)
+        return torch.as_tensor(_rounded_up(_numbers(squared.sqrt())), device=squared.device)
+
+
+def _numbers(values: Tensor) -> np.ndarray:
+    """The values of a tensor, also within ``torch.func``, where NumPy cannot share its memory."""
+    return np.array(checks.traced_values(values).tolist(), np.float64)
 
 
 def _rounded_up(frequency: np.ndarray) -> np.ndarray:
@@ -163,7 +168,7 @@ def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> A
     axis = len(chain.batch_shape)
     pair = torch.stack([state.displacement, state.velocity], dim=axis)
     ahead = (None,) * (pair.ndim - axis - 1)  # axes of a state behind the batch
-    frequencies = checks.traced_values(frequency.reshape(-1).cpu()).numpy()
+    frequencies = _numbers(frequency.reshape(-1))
     weight = chain.align((4 / frequency.square()).to(chain.masses)[..., None] / chain.masses, pair)
     now = 0.0
 

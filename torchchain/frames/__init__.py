@@ -3,7 +3,7 @@
 from torchchain.frames.doubts import check_energy
 from torchchain.frames.formats import FORMATS
 from torchchain.frames.reading import Frames, convert, read_frames
-from torchchain.frames.record import Box, Contacts, Frame, FramesWarning
+from torchchain.frames.record import Box, Contacts, Frame, FramesWarning, VectorTrajectory
 from torchchain.frames.registry import Format
 from torchchain.frames.units import ContactUnits
 
@@ -16,6 +16,7 @@ __all__ = [
     "Frame",
     "Frames",
     "FramesWarning",
+    "VectorTrajectory",
     "check_energy",
     "convert",
     "read_frames",

@@ -11,7 +11,7 @@ from torchchain import checks
 from torchchain.chain.states import Trajectory
 from torchchain.frames.doubts import check_across, check_bounds, check_digits, here, warn
 from torchchain.frames.order import check_contact_order, line_axis, line_order
-from torchchain.frames.record import AXES, Box, Frame
+from torchchain.frames.record import AXES, Box, Frame, VectorTrajectory
 from torchchain.memory import gigabytes, memory
 
 
@@ -24,7 +24,7 @@ def displacements(
     reference_name: str,
     axis: str | None,
     length: float,
-) -> Trajectory:
+) -> Trajectory | VectorTrajectory:
     """Displacements from a reference, and velocities; see :meth:`Frames.trajectory`."""
     _check_alike(name, first, reference, reference_name)
     line = line_axis(name, first, axis)
@@ -82,8 +82,8 @@ def displacements(
     if line is not None:
         _check_line(name, numbers, moved[..., 0], first, reference, order, line)
         check_across(name, last, line)
-        moved, velocity = moved[..., 0], velocity[..., 0]
-    return Trajectory(times - times[0], moved, velocity)
+        return Trajectory(times - times[0], moved[..., 0], velocity[..., 0])
+    return VectorTrajectory(times - times[0], moved, velocity)
 
 
 def _period(box: Box | None, axis: str) -> float:

@@ -22,7 +22,7 @@ from torchchain.frames.chains import chain as make_chain
 from torchchain.frames.doubts import check_energy, here
 from torchchain.frames.motion import displacements
 from torchchain.frames.opening import File, Place, Source, find, time_of
-from torchchain.frames.record import Box, Contacts, Frame
+from torchchain.frames.record import Box, Contacts, Frame, VectorTrajectory
 from torchchain.frames.registry import Entry, Raw
 from torchchain.frames.units import ContactUnits, fit_units, scaled_contacts
 
@@ -264,7 +264,7 @@ class Frames:
 
     def trajectory(
         self, reference: Source | Frames | Frame | None = None, *, axis: str | None = None, chain: Chain | None = None
-    ) -> Trajectory:
+    ) -> Trajectory | VectorTrajectory:
         """Displacements from a reference, across periodic boundaries, and velocities.
 
         Args:
@@ -275,7 +275,7 @@ class Frames:
 
         Returns:
             Trajectory with times counted from the first frame, and displacement and velocity (time, particle) in the order of
-            :meth:`chain`, or (time, particle, axis).
+            :meth:`chain`; or VectorTrajectory, (time, particle, axis).
 
         Raises:
             FieldError: for other particles than the reference's, for neighbors that pass each other, without velocities or times.
@@ -287,7 +287,7 @@ class Frames:
         found = displacements(self.name, self, len(self), self.first, at_rest, name, axis, self._unit("length"))
         if chain is not None:
             checks.instance("chain", chain, Chain)
-            if found.displacement.ndim != 2 or chain.masses.shape != found.displacement.shape[-1:]:
+            if not isinstance(found, Trajectory) or chain.masses.shape != found.displacement.shape[-1:]:
                 raise checks.fail(
                     "chain",
                     f"have masses of shape {tuple(found.displacement.shape[1:])}",

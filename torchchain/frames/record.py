@@ -78,3 +78,17 @@ class Frame:
     radii: Tensor | None = None
     box: Box | None = None
     contacts: Contacts | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class VectorTrajectory:
+    """Motion of particles that form no line, in the order of their ids.
+
+    Attributes:
+        times: (time,).
+        displacement, velocity: (time, particle, axis).
+    """
+
+    times: Tensor
+    displacement: Tensor
+    velocity: Tensor

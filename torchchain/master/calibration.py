@@ -147,7 +147,7 @@ def calibrate(
 def _record(transfer: BandTransfer, asked: Recipe, report: Report) -> Calibration:
     method = "linear" if asked.fit is None else asked.fit.name
     model = "paper" if asked.model is None else asked.model.name
-    words = "" if transfer.scene is not None else str(getattr(transfer, "provenance", "") or "")
+    words = transfer.provenance.words if transfer.scene is None and transfer.provenance is not None else ""
     return Calibration(method, model, asked.window, transfer.scene, report, words)
 
 

@@ -27,8 +27,9 @@ from torchchain.evolvers.chebyshev import check_work
 from torchchain.evolvers.coefficients import coefficients_of
 from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS
 from torchchain.evolvers.method import Advance, Method
+from torchchain.modes import phase
 from torchchain.network.lattices import PRIMITIVE, STEPS, Lattice
-from torchchain.network.modes import check_stability
+from torchchain.network.modes import check_stability, exceeds
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import NetworkTrajectory
 
@@ -76,8 +77,10 @@ def highest_frequency(network: Network, bound: float | Tensor | None = None) -> 
 
     Args:
         network: any.
-        bound: of the squared frequency, a number or (*batch,), taken as it is (too small a one makes states grow without
-            limit, which ``evolve`` notices); by default the network's own, which is rigorous.
+        bound: of the squared frequency, a number or (*batch,); by default the network's own, which is rigorous.
+
+    Raises:
+        FieldError: if a squared frequency exceeds the ``bound``, which would make states grow without limit.
     """
     with torch.no_grad():
         if bound is None:
@@ -90,6 +93,11 @@ def highest_frequency(network: Network, bound: float | Tensor | None = None) -> 
                     "bound", f"be a number or have shape {tuple(network.batch_shape)}", f"shape {tuple(squared.shape)}"
                 )
             squared = squared.expand(network.batch_shape)
+            exceeded = torch.zeros(network.batch_shape, dtype=torch.bool, device=squared.device)
+            for member in np.ndindex(*network.batch_shape):
+                exceeded[member] = exceeds(network, float(squared[member]), member)
+            rule = "not lie below the largest squared frequency (network.squared_frequency_bound() never does)"
+            checks.first_bad("bound", rule, squared, exceeded, "network")
         frequency = squared.clamp(min=1e-300).sqrt().cpu().numpy()  # no bonds: any W will do
         mantissa, exponent = np.frexp(frequency)  # rounded up to 24 bits, so that W^2 is exact
         return torch.as_tensor(np.ldexp(np.ceil(mantissa * 2**24) / 2**24, exponent), device=squared.device)
@@ -128,6 +136,7 @@ def _plain(network: Network, state: State, frequency: Tensor, tolerance: float) 
     def advance(times: Tensor) -> NetworkTrajectory:
         nonlocal pair, now
         check_work(times, frequencies.max())
+        phase.check(times, frequency, pair.dtype)
         outputs = []
         for t in _later(times, now):
             leaps = np.ceil(frequencies * (t - now) / LEAP)
@@ -372,6 +381,7 @@ class CompiledAdvance:
 
     def __call__(self, times: Tensor) -> NetworkTrajectory:
         check_work(times, float(self.frequencies.max()))
+        phase.check(times, torch.from_numpy(self.frequencies), torch.float64)
         later = _later(times, self._now)
         rows = len(self._anchors)
         n, c = self._shape[-2:]

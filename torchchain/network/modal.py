@@ -8,6 +8,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import State
 from torchchain.evolvers.method import Advance, Method
+from torchchain.modes import phase
 from torchchain.network.modes import NetworkModes, normal_modes
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import NetworkTrajectory
@@ -41,9 +42,10 @@ def start(network: Network, state: State, modes: NetworkModes | None = None) -> 
     w = w.reshape(*w.shape[:-1], *[1] * (state.displacement.ndim - batch - 2), 1, w.shape[-1])
 
     def advance(times: Tensor) -> NetworkTrajectory:
+        phase.check(times, modes.frequencies, modes.frequencies.dtype)
         t = times.to(w)[:, None]
-        phase = w * t
-        sine, cosine = phase.sin(), phase.cos()
+        angle = w * t
+        sine, cosine = angle.sin(), angle.cos()
         integral = torch.where(w == 0, t, sine / torch.where(w == 0, 1.0, w))  # a zero mode drifts
         unflat = (network.n_particles, network.n_components)
         displacement = (coordinate * cosine + speed * integral) @ shapes

@@ -236,6 +236,16 @@ def check_stability(network: Network) -> None:
             raise _unstable(float(lowest[0]), negative, member)
 
 
+def exceeds(network: Network, squared: float, member: tuple[int, ...] = ()) -> bool:
+    """Whether a squared frequency of one network of the batch exceeds a number by more than rounding.
+
+    None does exactly where the number times M, less K, has no negative eigenvalue.
+    """
+    masses = network.masses.detach()[member].double().cpu().numpy().repeat(network.n_components)
+    matrix = squared * (1 + 1e-10) * diags(masses) - network.sparse_stiffness(member)
+    return _negative_pivots(matrix.tocsc()) > 0
+
+
 def _negative_pivots(matrix: csr_matrix) -> int:
     """Negative eigenvalues of a symmetric matrix, by elimination without exchange of rows."""
     factors = sparse_linalg.splu(

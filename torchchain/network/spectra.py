@@ -21,6 +21,7 @@ from torchchain.network.bands import plane_wave
 from torchchain.network.chebyshev import highest_frequency, layout_of
 from torchchain.network.disorder import uniform
 from torchchain.network.lattices import Lattice, dynamical_matrix, reciprocal
+from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network
 
 _STARTS = 5  # the random stream of the starts
@@ -58,6 +59,7 @@ def spectral_moments(network: Network, starts: Tensor, n_moments: int) -> tuple[
         )
     n_moments = 2 * (checks.integer("n_moments", n_moments, 2, 10**6) // 2)
     network.check_state(starts)
+    check_stability(network)
     with torch.no_grad():
         top = float(highest_frequency(network))
         starts = starts.detach()

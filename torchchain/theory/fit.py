@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 from scipy.optimize import least_squares
 from torch import Tensor
 
@@ -145,15 +146,18 @@ def fit_disorder(
 def _pooled(
     variance: np.ndarray, curve: bool, shape: tuple[int, ...], tones: Sequence[int], n_particles: int
 ) -> np.ndarray:
-    """One variance for all bands but the source's own: those of a few chains are large where their energies are large.
+    """Variances pooled over neighboring times and sources, and over all bands but the source's own.
 
-    Weights by them would pull the estimate down.
+    Those of a few chains are large where their energies are large: weights by them would pull the estimate down, and
+    make its error look smaller than it is.
     """
     if curve:
-        return variance
+        return uniform_filter(variance, 5, mode="nearest")
     bands = np.array([band_of(tone, n_particles, shape[2]) - 1 for tone in tones])
     cube = variance.reshape(shape)
-    other = np.ones((len(tones), 1, shape[2]))
-    other[np.arange(len(tones)), 0, bands] = 0
-    mean = (cube * other).sum(-1, keepdims=True) / max(shape[2] - 1, 1)
-    return np.where(other > 0, mean, cube).ravel()
+    rows = np.arange(len(tones))
+    own = cube[rows, :, bands]
+    mean = (cube.sum(-1) - own) / max(shape[2] - 1, 1)
+    pooled = np.repeat(uniform_filter(mean, 5, mode="nearest")[..., None], shape[2], axis=-1)
+    pooled[rows, :, bands] = uniform_filter(own, 5, mode="nearest")
+    return pooled.ravel()
