@@ -24,7 +24,7 @@ from scipy import special
 import torchchain as tc
 from torchchain import checks
 from torchchain.evolvers import chebyshev, coefficients, expansion, ode
-from torchchain.evolvers.drift import EnergyDriftError
+from torchchain.evolvers.energy_guard import EnergyDriftError
 from torchchain.threads import single_blas_thread
 
 

@@ -12,7 +12,7 @@ import torchchain as tc
 from torchchain.chain.amplitude import LinearityWarning
 from torchchain.checks import FieldError
 from torchchain.evolvers import METHODS
-from torchchain.evolvers.drift import EnergyDriftError
+from torchchain.evolvers.energy_guard import EnergyDriftError
 
 TIMES = torch.tensor([0.0, 0.4, 1.0, 3.0], dtype=torch.float64)
 BITWISE = ("chebyshev", "verlet", "symplectic4")

@@ -31,6 +31,7 @@ from torchchain.ensemble.statistics import EnsembleMoments
 
 SCENE = tc.Scene(n_particles=16, n_bands=4, realizations=40, seed=3, times=[0.0, 1.0, 7.0])
 FLAGS = "--n-particles 16 --n-bands 4 --realizations 40 --times.stop 5 --seed 3 --method modes".split()
+COMMANDS = {"simulate": FLAGS, "calibrate": [*FLAGS, *"--fit linear --model paper --bootstrap 0".split()]}  # quick fits
 EVERY = ["--checkpoint-every", "0"]  # after every chunk of two chains
 pytestmark = pytest.mark.filterwarnings("ignore:prediction to time")
 
@@ -144,7 +145,7 @@ def reference(tmp_path_factory):
     found = {}
     for command in ("simulate", "calibrate"):
         out = tmp_path_factory.mktemp("reference") / command
-        assert cli.main([command, *FLAGS, "--out", str(out)]) == 0
+        assert cli.main([command, *COMMANDS[command], "--out", str(out)]) == 0
         found[command] = data_of(out)
     return found
 
@@ -153,7 +154,7 @@ def reference(tmp_path_factory):
 @pytest.mark.parametrize("command", ["simulate", "calibrate"])
 @pytest.mark.usefixtures("no_drawing")
 def test_killed_and_resumed(command, owner, name, count, after, reference, tmp_path):
-    arguments = [command, *FLAGS, *EVERY, "--out", str(tmp_path / "out")]
+    arguments = [command, *COMMANDS[command], *EVERY, "--out", str(tmp_path / "out")]
     assert forked(arguments, partial(killed_at, owner, name, count, after)) == -signal.SIGKILL
     assert cli.main(arguments) == 0
     assert data_of(tmp_path / "out") == reference[command]
@@ -169,7 +170,7 @@ def test_killed_and_resumed(command, owner, name, count, after, reference, tmp_p
 @pytest.mark.usefixtures("no_drawing")
 def test_killed_again_and_again(reference, tmp_path):
     arguments = ["simulate", *FLAGS, *EVERY, "--out", str(tmp_path / "out")]
-    for _ in range(6):
+    for _ in range(3):
         killing = partial(killed_at, "torchchain.ensemble.run:EnsembleMoments", "absorb", 3, False)
         assert forked(arguments, killing) == -signal.SIGKILL
         assert len(os.listdir(tmp_path / "out" / "checkpoint")) <= 2  # what came before, and the session's own
@@ -342,6 +343,30 @@ def test_leftovers_of_a_save_are_cleared_and_other_files_left_alone(whole, tmp_p
     assert equal(tc.simulate(SCENE, "modes", checkpoint=tmp_path), whole)
     assert not list(tmp_path.glob("*.tmp"))
     assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def test_one_run_a_folder(tmp_path):
+    with Checkpoint(tmp_path / "kept").lock():
+        with pytest.raises(FieldError, match=rf"checkpoint must be free, got .*/kept, where process {os.getpid()} on"):
+            tc.simulate(SCENE, "modes", checkpoint=tmp_path / "kept")
+        tc.simulate(SCENE, "modes", checkpoint=Checkpoint(tmp_path / "kept.1", 0))
+    assert sorted(os.listdir(tmp_path)) == ["kept.1"]
+
+
+def test_clearing_takes_only_what_the_run_has_left(tmp_path):
+    tc.simulate(SCENE, "modes", checkpoint=Checkpoint(tmp_path / "kept", 0))
+    (tmp_path / "kept" / "mine.txt").write_text("mine")
+    Checkpoint(tmp_path / "kept").clear()
+    assert os.listdir(tmp_path / "kept") == ["mine.txt"]
+
+
+def test_going_on_says_of_how_many(tmp_path, monkeypatch, caplog):
+    interrupted(tmp_path, monkeypatch)
+    with caplog.at_level("INFO", logger="torchchain"):
+        tc.simulate(SCENE, "modes", checkpoint=tmp_path)
+    assert [record.message for record in caplog.records] == [
+        f"20 of 40 realizations are in {tmp_path}: going on from there"
+    ]
 
 
 CHANGES = [

@@ -16,8 +16,8 @@ from torchchain.chain.amplitude import (
     linearity,
     warn_if_nonlinear,
 )
-from torchchain.evolvers import METHODS, drift, symplectic
-from torchchain.evolvers.drift import EnergyDriftError
+from torchchain.evolvers import METHODS, energy_guard, symplectic
+from torchchain.evolvers.energy_guard import EnergyDriftError
 from torchchain.evolvers.verlet import VERLET
 
 HERTZ = [name for name, entry in METHODS.items() if "hertz" in entry.contacts]
@@ -214,7 +214,7 @@ def test_energy_that_is_not_a_number_is_caught():
     start = tc.standing_wave(chain, 6, 0.5)
     nan = tc.Trajectory(time_grid(1, 1), torch.full((2, 24), torch.nan), torch.zeros(2, 24))
     with pytest.raises(EnergyDriftError, match=r"got nan at time 0 \(remedy\)"):
-        drift.check(chain, nan, initial_energy(chain, start)[0], 0.1, "remedy")
+        energy_guard.check(chain, nan, initial_energy(chain, start)[0], 0.1, "remedy")
 
 
 def test_limit_counts_the_initial_overlap():

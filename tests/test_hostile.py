@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.evolvers import ode
-from torchchain.evolvers.drift import EnergyDriftError
+from torchchain.evolvers.energy_guard import EnergyDriftError
 from torchchain.master import IntegrationError
 from torchchain.modes.spectrum import DecompositionError
 
@@ -177,7 +177,7 @@ CALLS = {
 
 def test_every_public_function_is_here():
     records = {"EnergyMoments", "Linearity", "Plan"}  # results alone
-    kinds = {"METHODS", "SOLVERS", "LinearityWarning", "TrustWarning"}
+    kinds = {"Advance", "METHODS", "Method", "SOLVERS", "register_method", "LinearityWarning", "TrustWarning"}
     assert set(tc.__all__) - records - kinds <= set(CALLS)
 
 

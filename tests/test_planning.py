@@ -9,11 +9,12 @@ import torch
 import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.cli import main
-from torchchain.ensemble import layout
+from torchchain.ensemble import layout, predictions
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.moving_part import PartExceeded, moving_part
 from torchchain.ensemble.plan import forecast
 from torchchain.ensemble.scene import regular_times
+from torchchain.evolvers import start
 from torchchain.master.stand_in import plan
 
 
@@ -311,3 +312,86 @@ def test_chains_too_long_for_the_memory_of_a_method_leave_it_out():
     planned = plan(wanted)
     assert planned.method == "chebyshev"
     assert not {"modes", "tridiagonal"} & {other.method for other in planned.runners_up}
+
+
+STIFF = [tc.Disorder("gamma", 1.0), tc.Disorder("lognormal", 0.9)]
+
+
+@pytest.mark.parametrize("stiffness", STIFF)
+def test_planned_steps_are_stable_for_the_stiffest_of_many_chains(stiffness):
+    """The step that is handed to a method is refused beyond the stability limit of any chain."""
+    wanted = scene(
+        contact="hertz", stiffness_disorder=stiffness, realizations=400, tolerance=0.5, times=torch.tensor([20.0]),
+        excitation=tc.Impulse(20, 0.05),
+    )  # fmt: skip
+    chain = wanted.chain(range(400))
+    state = wanted.state(chain)
+    steps = [choice for choice in plan(wanted).choices if "step" in choice.options]
+    assert {choice.method for choice in steps} == {"verlet", "symplectic4"}
+    for choice in steps:
+        start(chain, state, choice.method, **choice.options)
+
+
+def test_limits_of_chains_that_were_not_drawn(monkeypatch):
+    """What the tail of some chains tells of the stiffest of more."""
+    wanted = scene(contact="hertz", stiffness_disorder=STIFF[0], realizations=1000, excitation=tc.Impulse(20, 0.05))
+    monkeypatch.setattr(predictions, "SAMPLE", 20 * 64)
+    limit = predictions.Facts(wanted).limit
+    highest = float(wanted.chain(range(1000)).squared_frequency_bound().sqrt().max())
+    assert highest < limit / 0.7  # the part of the limit that steps are planned for
+    assert limit < 3 * highest
+
+
+@pytest.mark.parametrize("stiffness", STIFF)
+@pytest.mark.parametrize("fields", [{"contact": "hertz"}, {"damping": 0.05}])
+def test_steps_in_stiff_chains_keep_to_the_tolerance(stiffness, fields):
+    wanted = scene(
+        stiffness_disorder=stiffness, realizations=10, tolerance=1e-3, observables=("energy",), energy_definition="bond",
+        excitation=tc.StandingWave((8, 25), 0.02), **fields,
+    )  # fmt: skip
+    exact = tc.simulate(wanted, "symplectic4", options={"step": 0.01}) if "contact" in fields else None
+    exact = tc.simulate(wanted, "damped") if exact is None else exact
+    for choice in plan(wanted).choices:
+        if "step" in choice.options and choice.good and choice.dtype == torch.float64:
+            found = tc.simulate(wanted, choice.method, options=choice.options)
+            assert float(abs(found.energy - exact.energy).max() / exact.energy.max()) <= choice.predicted_error
+
+
+AMPLITUDES = [
+    (tc.StandingWave((8,), 0.04), 200.0, 0.3),
+    (tc.StandingWave((2,), 0.004), 400.0, 0.1),
+    (tc.Impulse(32, 0.02), 80.0, 0.3),
+    (tc.Impulse(1, 0.02), 80.0, 0.0),
+]
+
+
+@pytest.mark.parametrize(("excitation", "end", "xi"), AMPLITUDES)
+def test_nonlinearity_accumulates(excitation, end, xi):
+    """What linear contacts do to energies by the last time is within what the plan expects of them."""
+    disorder, times = tc.Disorder(strength=xi), regular_times(0.0, end, end / 10)
+    wanted = scene(
+        excitation=excitation, disorder=disorder, times=times, observables=("energy",), energy_definition="bond"
+    )
+    linear, hertz = (
+        tc.simulate(replace(wanted, contact=law), "symplectic4", options={"step": 0.1}).energy
+        for law in ("linear", "hertz")
+    )
+    off = float(abs(linear - hertz).max() / hertz.max())
+    assert off <= predictions.Facts(wanted).accumulated
+    chosen = planning.resolved(replace(wanted, contact="auto", tolerance=min(0.9, off * 0.99))).contact
+    assert chosen == "hertz"
+
+
+def test_the_choice_is_the_same_on_any_machine(monkeypatch):
+    wanted = scene(n_particles=512, realizations=50)
+    first = plan(wanted)
+    monkeypatch.setattr(planning, "speed", lambda: 50.0)
+    second = plan(wanted)
+    assert (first.method, first.options, first.cost) == (second.method, second.options, second.cost)
+    assert second.predicted_seconds > 1.5 * first.predicted_seconds
+
+
+def test_plans_print_in_few_lines():
+    found = plan(scene(tolerance=1e-3))
+    assert 6 <= len(str(found).splitlines()) <= 14
+    assert "<table>" in found._repr_html_()

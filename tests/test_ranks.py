@@ -18,6 +18,7 @@ from torchchain.ensemble.ranks import ALONE, Ranks
 from torchchain.ensemble.statistics import joined
 
 FLAGS = "--n-particles 16 --n-bands 4 --realizations 45 --times.stop 5 --seed 3 --method modes".split()
+FIT = "--fit linear --model paper --bootstrap 0".split()  # quick
 pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
 
 
@@ -49,10 +50,10 @@ def alone(tmp_path, monkeypatch):
 
 
 def test_two_processes(tmp_path, alone):
-    done = torchrun(2, tmp_path, "calibrate", *FLAGS, "--out", "two")
+    done = torchrun(2, tmp_path, "calibrate", *FLAGS, *FIT, "--out", "two")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("results in two") == 1  # only rank 0 writes and speaks
-    one, two = alone("calibrate", *FLAGS, out="one"), tmp_path / "two"
+    one, two = alone("calibrate", *FLAGS, *FIT, out="one"), tmp_path / "two"
     assert data_of(two / "transfer.nc") == data_of(one / "transfer.nc")
     assert (two / "model.safetensors").read_bytes() == (one / "model.safetensors").read_bytes()
     assert sorted(os.listdir(two)) == sorted(os.listdir(one))

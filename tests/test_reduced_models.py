@@ -259,9 +259,11 @@ def test_the_wording_of_conventions_may_change(small_transfer, tmp_path, monkeyp
         tc.MasterEquation.load(tmp_path / "q.safetensors")
 
 
-def test_a_model_without_a_calibration_is_not_saved(tmp_path):
-    with pytest.raises(FieldError, match="calibration must be there for a model to be saved"):
-        tc.MasterEquation(tc.RateModel(EYE * 0, EYE), None).save(tmp_path / "q.safetensors")
+def test_a_model_of_ones_own_is_saved(tmp_path):
+    tc.MasterEquation(tc.RateModel(EYE * 0, EYE), None).save(tmp_path / "q.safetensors")
+    again = tc.MasterEquation.load(tmp_path / "q.safetensors")
+    assert (again.calibration.model, again.calibration.scene) == ("given", None)
+    assert torch.equal(again.transfer([3.0])[:, 0].detach(), EYE)
 
 
 def test_reports_are_saved_field_by_field(small_transfer, tmp_path):

@@ -1,6 +1,9 @@
 # The public names: __all__ holds the everyday ones, the rest resolve as well (also under tc.energy, tc.master).
 from torchchain import energy as energy
+from torchchain import frames as frames
 from torchchain import master as master
+from torchchain import network as network
+from torchchain import theory as theory
 from torchchain._version import __version__ as __version__
 from torchchain.chain import Chain as Chain
 from torchchain.chain import Disorder as Disorder
@@ -48,8 +51,10 @@ from torchchain.ensemble.statistics import total_variation as total_variation
 from torchchain.evolvers import METHODS as METHODS
 from torchchain.evolvers import Advance as Advance
 from torchchain.evolvers import Method as Method
-from torchchain.evolvers import evolve as evolve
 from torchchain.evolvers import register_method as register_method
+from torchchain.frames import Frames as Frames
+from torchchain.frames import FramesWarning as FramesWarning
+from torchchain.frames import read_frames as read_frames
 from torchchain.master import MODELS as MODELS
 from torchchain.master import SOLVERS as SOLVERS
 from torchchain.master import Calibration as Calibration
@@ -79,11 +84,15 @@ from torchchain.modes import DecompositionError as DecompositionError
 from torchchain.modes import NormalModes as NormalModes
 from torchchain.modes import SpectrumWarning as SpectrumWarning
 from torchchain.modes import localization as localization
-from torchchain.modes import normal_modes as normal_modes
 from torchchain.modes.localization import count_modes_below as count_modes_below
 from torchchain.modes.localization import integrated_density_of_states as integrated_density_of_states
 from torchchain.modes.localization import lyapunov_exponent as lyapunov_exponent
 from torchchain.modes.localization import weak_disorder_lyapunov as weak_disorder_lyapunov
+from torchchain.network import Network as Network
+from torchchain.network import lattice as lattice
+from torchchain.network import packing as packing
+from torchchain.network.systems import evolve as evolve
+from torchchain.network.systems import normal_modes as normal_modes
 from torchchain.results import RunFolder as RunFolder
 from torchchain.results import open_folder as open
 
@@ -99,11 +108,13 @@ __all__ = [
     "FieldError",
     "FieldTypeError",
     "FitWarning",
+    "Frames",
     "Impulse",
     "LinearityWarning",
     "MasterEquation",
     "MasterFamily",
     "Method",
+    "Network",
     "NormalModes",
     "Observable",
     "Plan",
@@ -124,13 +135,16 @@ __all__ = [
     "energy_width",
     "evolve",
     "impulse",
+    "lattice",
     "localization",
     "long_time_band_energy",
     "normal_modes",
     "open",
+    "packing",
     "paper_rates",
     "particle_energy",
     "plan",
+    "read_frames",
     "register_method",
     "register_model",
     "register_observable",

@@ -140,6 +140,13 @@ def is_transformed(values: Tensor) -> bool:
     return torch._C._functorch.is_functorch_wrapped_tensor(values)  # there is no public way
 
 
+def traced_values(values: Tensor) -> Tensor:
+    """The numbers inside what ``torch.func`` traces, with an axis more for every ``vmap``; for bounds that hold for all."""
+    while is_transformed(values):
+        values = torch._C._functorch.get_unwrapped(values)
+    return values
+
+
 def finite(field: str, values: Tensor, axis: str = "position") -> Tensor:
     """The values, if all are finite numbers; one pass over them, where they are."""
     if not is_transformed(values) and not bool(values.detach().sum().isfinite()):  # also where only the sum overflows

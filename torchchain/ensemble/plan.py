@@ -23,7 +23,7 @@ from torchchain.threads import single_thread
 ARTIFACT = "master equation"
 ORDERED_TOLERANCE = 1e-9
 FRACTION_OF_NOISE = 1 / 3  # adds 5 % to the statistical error
-SMALL_WORK = 0.02  # seconds of work that are not worth loading compiled kernels for, which takes half a second
+SMALL_WORK = 0.008  # seconds of work that are not worth loading compiled kernels for, which takes half a second
 RUN_SECONDS = 3e-3  # of any run
 CPU = torch.device("cpu")
 

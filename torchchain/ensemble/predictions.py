@@ -15,7 +15,6 @@ from torchchain.ensemble.moving_part import moving_part
 from torchchain.ensemble.observables import chosen_observables, is_fused
 from torchchain.ensemble.scene import Scene
 from torchchain.evolvers import METHODS, Method
-from torchchain.evolvers.drift import total
 from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, terms
 
 EPS = {torch.float64: 2.0**-53, torch.float32: 2.0**-24}
@@ -151,11 +150,11 @@ def _white(chain: Chain) -> State:
 
 
 def _mean_power(chain: Chain, state: State, power: int) -> float:
-    first = total(chain, state.displacement, state.velocity)
+    first = chain.energy(state.displacement, state.velocity)
     for _ in range(power):
         force = chain.force(state.displacement)
         state = State(state.velocity, force / chain.align(chain.masses, force))
-    return float((total(chain, state.displacement, state.velocity) / first).mean(0).max().sqrt())
+    return float((chain.energy(state.displacement, state.velocity) / first).mean(0).max().sqrt())
 
 
 # --------------------------------------------------------------------------------------------------------------- errors

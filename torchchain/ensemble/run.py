@@ -233,7 +233,8 @@ def ensemble_moments(
     }  # fmt: skip
     with ExitStack() as held:
         # Rank 0 reads what was kept and chooses; every rank follows.
-        kept, begin = Kept(EnsembleMoments(*cut)), None
+        kept = Kept(EnsembleMoments(*cut))
+        begin: Any = None
         if ranks.rank == 0:
             try:
                 if checkpoint is not None:

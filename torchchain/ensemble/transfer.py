@@ -317,7 +317,7 @@ def _late_average(times: Tensor, energies: Tensor) -> tuple[Tensor, Tensor]:
     late = energies[:, :, 2 * times >= times[-1]]
     first, second = late.tensor_split(2, dim=2)
     unsettled = (
-        (second.mean((0, 2)) - first.mean((0, 2))).abs() / 2 if first.shape[2] else torch.zeros(late.shape[1::2])
+        (second.mean((0, 2)) - first.mean((0, 2))).abs() / 2 if second.shape[2] else torch.zeros(late.shape[1::2])
     )
     return late.mean(2), unsettled.double()
 

@@ -16,7 +16,7 @@ for _method in (
 ):  # fmt: skip
     register_method(_method)
 
-__all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "register_method", "start"]
+__all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "evolved", "register_method", "start"]
 
 
 def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:
@@ -38,8 +38,15 @@ def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **opti
     Warns:
         LinearityWarning: for linear contacts that the start would open (elongation 1, the initial overlap).
     """
+    return evolved(chain, state, times, method, options, stacklevel=4)
+
+
+def evolved(
+    chain: Chain, state: State, times: Any, method: str, options: dict[str, Any], stacklevel: int
+) -> Trajectory:
+    """:func:`evolve`, whose warning names the line so many calls up."""
     advance = start(chain, state, method, **options)
-    amplitude.warn_if_nonlinear(chain, state, amplitude.DEVIATION_WHERE_OPEN, stacklevel=3)
+    amplitude.warn_if_nonlinear(chain, state, amplitude.DEVIATION_WHERE_OPEN, stacklevel=stacklevel)
     return advance(checks.times("times", times).to(state.displacement.device))
 
 

@@ -21,6 +21,7 @@ kernels of :mod:`stencil` do the same.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -31,9 +32,11 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
+from torchchain.evolvers import kernels
 from torchchain.evolvers.expansion import LEAP, ROUNDING, SEGMENTS
 from torchchain.evolvers.method import Advance, Method
 from torchchain.modes import phase
+from torchchain.modes.localization import negative_pivots
 
 if TYPE_CHECKING:
     from torchchain.evolvers.stencil import March, Rows
@@ -80,6 +83,7 @@ def _compilable(chain: Chain, state: State) -> bool:
         x.device.type == "cpu"
         and x.dtype in (torch.float32, torch.float64)
         and not (x.requires_grad and torch.is_grad_enabled())
+        and not checks.is_transformed(x)
         for x in tensors
     )
 
@@ -98,7 +102,14 @@ def highest_frequency(chain: Chain, bound: float | Tensor | None = None) -> Tens
         squared = (
             chain.squared_frequency_bound(SWEEPS).to(torch.float64) if bound is None else _checked_bound(chain, bound)
         )
-        return torch.as_tensor(_rounded_up(squared.sqrt().cpu().numpy()), device=squared.device)
+        if checks.is_transformed(squared):  # one bound for all that vmap runs at once
+            squared = checks.traced_values(squared).amax().expand(chain.batch_shape)
+        return torch.as_tensor(_rounded_up(_numbers(squared.sqrt())), device=squared.device)
+
+
+def _numbers(values: Tensor) -> np.ndarray:
+    """The values of a tensor, also within ``torch.func``, where NumPy cannot share its memory."""
+    return np.array(checks.traced_values(values).tolist(), np.float64)
 
 
 def _rounded_up(frequency: np.ndarray) -> np.ndarray:
@@ -116,11 +127,13 @@ def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
             "bound", f"be a number or have shape {tuple(chain.batch_shape)}", f"shape {tuple(squared.shape)}"
         )
     squared = squared.expand(chain.batch_shape)
+    double = replace(chain, masses=chain.masses.double())
     checks.first_bad(
         "bound",
         "not lie below the largest squared frequency (chain.squared_frequency_bound() never does)",
         squared,
-        _exceeded(chain, squared),
+        # A margin for rounding; no single high mode escapes a count of all of them.
+        negative_pivots(double, (squared * (1 + 1e-12))[..., None])[..., 0] < chain.n_particles,
         "chain",
     )
     own = WASTE * chain.squared_frequency_bound(SWEEPS).to(torch.float64)
@@ -129,34 +142,11 @@ def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
     return squared
 
 
-def _exceeded(chain: Chain, squared: Tensor) -> Tensor:
-    """Whether a squared frequency of each chain exceeds the bound by more than rounding, (*batch,).
+def kernels_compiled() -> bool:
+    """Whether the kernels need no compiling, in this process or from Numba's cache; the answer takes loading Numba."""
+    from torchchain.evolvers.stencil import march
 
-    No eigenvalue of A exceeds the bound exactly where bound M + K is positive semidefinite, and by Sylvester's law of
-    inertia that is where elimination finds no negative pivot: a test that no single high mode escapes.
-    """
-    n = chain.n_particles
-    masses = chain.masses.double().reshape(-1, n).cpu().numpy().T
-    stiffness = chain.contact_stiffness.double().reshape(-1, chain.n_contacts).cpu().numpy().T
-    right = np.roll(stiffness, -1, axis=0) if chain.boundary == "periodic" else stiffness[1:]
-    diagonal = squared.reshape(-1).cpu().numpy() * (1 + 1e-12) * masses - stiffness[:n] - right
-    # On a ring the last particle is coupled to the first, too, and by elimination to each of the others in turn.
-    corner = stiffness[0] if chain.boundary == "periodic" else np.zeros_like(stiffness[0])
-    exceeded = np.zeros(corner.shape, bool)
-    last = diagonal[-1]
-    pivot = diagonal[0]
-    for p in range(n - 1):
-        exceeded |= pivot <= 0
-        pivot = np.where(exceeded, 1.0, pivot)
-        coupling = right[p]
-        if p == n - 2:
-            last = last - (corner + coupling) ** 2 / pivot
-        else:
-            last = last - corner**2 / pivot
-            corner = -corner * coupling / pivot
-            pivot = diagonal[p + 1] - coupling**2 / pivot
-    exceeded |= last < 0
-    return torch.from_numpy(exceeded).reshape(squared.shape).to(squared.device)
+    return kernels.at_hand(march)
 
 
 def check_work(times: Tensor, frequency: float) -> None:
@@ -178,7 +168,7 @@ def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> A
     axis = len(chain.batch_shape)
     pair = torch.stack([state.displacement, state.velocity], dim=axis)
     ahead = (None,) * (pair.ndim - axis - 1)  # axes of a state behind the batch
-    frequencies = frequency.reshape(-1).cpu().numpy()
+    frequencies = _numbers(frequency.reshape(-1))
     weight = chain.align((4 / frequency.square()).to(chain.masses)[..., None] / chain.masses, pair)
     now = 0.0
 
@@ -221,7 +211,7 @@ def _later(times: Tensor, now: float) -> Tensor:
     """The times as float64 on the CPU, none before those of the last window."""
     if bool(times[0] < now):
         raise checks.fail("times", f"not go back behind the last window's end {now:g}", times[0].item())
-    return times.detach().to("cpu", torch.float64)
+    return checks.traced_values(times.detach().to("cpu", torch.float64))
 
 
 class CompiledAdvance:

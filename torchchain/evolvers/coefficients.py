@@ -49,7 +49,7 @@ def top_order(z):
 
 
 @kernel
-def coefficients(frequency, time, tolerance, bessel, cosine, drift, slope):
+def coefficients(frequency, time, tolerance, bessel, cosine, integral, slope):
     """c_k, s_k and d_k for one time; returns the number of terms.
 
     Terms are dropped while the sums of |c_k|, W |s_k| and |d_k| / W over all that are dropped stay within the
@@ -63,27 +63,27 @@ def coefficients(frequency, time, tolerance, bessel, cosine, drift, slope):
     bessel_functions(z, values)
     terms = 1
     odd = 0.0  # J_2k+1 + J_2k+3 + ...
-    dropped_cosine, dropped_drift, dropped_slope = 0.0, 0.0, 0.0
+    dropped_cosine, dropped_integral, dropped_slope = 0.0, 0.0, 0.0
     for k in range(values.size // 2 - 1, 0, -1):
         odd += values[2 * k + 1]
         difference = values[2 * k - 1] - values[2 * k + 1]
         if terms == 1:
             dropped_cosine += 2 * abs(values[2 * k])
-            dropped_drift += 4 * abs(odd)
+            dropped_integral += 4 * abs(odd)
             dropped_slope += abs(difference)
-            if max(dropped_cosine, dropped_drift, dropped_slope) > tolerance:
+            if max(dropped_cosine, dropped_integral, dropped_slope) > tolerance:
                 terms = k + 1
         if k < cosine.size:
             cosine[k] = 2 * values[2 * k]
-            drift[k] = 4 * odd / frequency
+            integral[k] = 4 * odd / frequency
             slope[k] = frequency * difference
     terms = min(max(4, 2 * ((terms + 1) // 2)), cosine.size)
-    rest_cosine, rest_drift, rest_slope = 0.0, 0.0, 0.0
+    rest_cosine, rest_integral, rest_slope = 0.0, 0.0, 0.0
     for k in range(terms - 1, 0, -1):
         rest_cosine += cosine[k]
-        rest_drift += drift[k]
+        rest_integral += integral[k]
         rest_slope += slope[k]
-    cosine[0], drift[0], slope[0] = 1.0 - rest_cosine, time - rest_drift, -rest_slope
+    cosine[0], integral[0], slope[0] = 1.0 - rest_cosine, time - rest_integral, -rest_slope
     return terms
 
 
@@ -93,7 +93,7 @@ class Tables(NamedTuple):
     offsets: np.ndarray  # time after the anchor; -1: none yet
     terms: np.ndarray
     cosine: np.ndarray
-    drift: np.ndarray
+    integral: np.ndarray
     slope: np.ndarray
     twice_cosine: np.ndarray
     twice_slope: np.ndarray
@@ -117,7 +117,7 @@ def tabulate(tables, frequency, tolerance, anchor, times, leaps, slack):
         offset = (times[j] - anchor) / leaps
         tables.offsets[j] = offset
         tables.terms[j] = coefficients(
-            frequency, offset, tolerance, tables.bessel, tables.cosine[j], tables.drift[j], tables.slope[j]
+            frequency, offset, tolerance, tables.bessel, tables.cosine[j], tables.integral[j], tables.slope[j]
         )
         for k in range(tables.terms[j]):
             tables.twice_cosine[j, k] = 2.0 * tables.cosine[j, k]

@@ -1,8 +1,7 @@
-"""Whether Numba's kernels are compiled and loaded, and a word before they are compiled."""
+"""Whether Numba's kernels are compiled, and a word before they are compiled."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +10,10 @@ from torchchain.progress import log
 _said = False
 
 
-def loaded() -> bool:
-    """Whether this process has loaded the kernels of method "chebyshev"."""
-    return "torchchain.evolvers.stencil" in sys.modules
-
-
-def in_cache(kernel: Any) -> bool:
-    """Whether Numba can take a kernel from the folder that it has chosen for its cache, on this installation."""
+def at_hand(kernel: Any) -> bool:
+    """Whether a kernel is compiled, in this process or in the folder that Numba has chosen for its cache here."""
+    if kernel.signatures:
+        return True
     if kernel.stats.cache_path is None:
         return False
     source = Path(kernel.py_func.__code__.co_filename)
@@ -25,16 +21,9 @@ def in_cache(kernel: Any) -> bool:
     return any(index.stat().st_mtime >= source.stat().st_mtime for index in found)
 
 
-def compiled() -> bool:
-    """Whether the kernels of method "chebyshev" need no compiling; the answer takes loading Numba."""
-    from torchchain.evolvers.stencil import march
-
-    return bool(march.signatures) or in_cache(march)
-
-
 def announce(kernel: Any) -> None:
     """Say that a kernel is about to be compiled, unless it is at hand; once in a process."""
     global _said
-    if not (_said or kernel.signatures or in_cache(kernel)):
+    if not (_said or at_hand(kernel)):
         _said = True
         log.warning("compiling kernels once, some 20 s ...")

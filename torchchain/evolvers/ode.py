@@ -27,7 +27,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
-from torchchain.evolvers import drift
+from torchchain.evolvers import energy_guard
 from torchchain.evolvers.method import Advance, Method
 from torchchain.evolvers.symplectic import (
     check_limits,
@@ -108,7 +108,7 @@ def _evolve(
     state = State(state.displacement.to(dtype), state.velocity.to(dtype))
     motion = _Motion(chain, state)
     n = chain.n_particles
-    initial = drift.total(chain, state.displacement, state.velocity).detach()
+    initial = chain.energy(state.displacement, state.velocity).detach()
     y = torch.cat([state.displacement, state.velocity], dim=-1)
     if motion.damped:
         y = torch.cat([y, torch.zeros_like(y[..., :1])], dim=-1)
@@ -136,7 +136,7 @@ def _evolve(
             stacked[..., -1] * motion.amplitude[..., None] if motion.damped else None,
             openings,
         )
-        drift.check(chain, trajectory, initial, ALLOWED_DRIFT, remedy)
+        energy_guard.check(chain, trajectory, initial, ALLOWED_DRIFT, remedy)
         return trajectory
 
     return advance

@@ -47,6 +47,7 @@ def close(w, row, at):
 
 @kernel
 def clear(w, begin, end):
+    """Zeros from cell begin to end - 1."""
     for i in range(U(begin), U(max(begin, end))):
         w[i] = 0.0
 
@@ -212,7 +213,7 @@ def advance(w, row, u, v, low, high, count, tables, mirror):
     start, stop, keep = low, high, 0.0
     if not _silent(w, v[0], low, high):
         start, stop = expand(
-            w, row, v[0], low, high, count, u[1:], v[1:], tables.terms, tables.drift, tables.cosine, 0.0, 0.0
+            w, row, v[0], low, high, count, u[1:], v[1:], tables.terms, tables.integral, tables.cosine, 0.0, 0.0
         )
         keep = 1.0
     if keep == 0.0 or not _silent(w, u[0], low, high):

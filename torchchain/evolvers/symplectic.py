@@ -22,7 +22,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
-from torchchain.evolvers import drift
+from torchchain.evolvers import energy_guard
 from torchchain.evolvers.method import Advance
 
 Pair = tuple[float, float]
@@ -77,7 +77,7 @@ def largest_overlap(chain: Chain, state: State) -> Tensor:
     The energy of a contact compressed by x is at least kappa x^2 / 2, and no contact can hold more than all of it.
     """
     with torch.no_grad():
-        energy = drift.total(chain, state.displacement, state.velocity)
+        energy = chain.energy(state.displacement, state.velocity)
         return 1 + (2 * energy / _of_states(chain, chain.contact_stiffness.amin(-1), state)).sqrt()
 
 
@@ -150,7 +150,7 @@ def start(chain: Chain, state: State, composition: Composition, method: str, ste
     advance = march(chain, state, composition, steps)
     if chain.contact == "linear":
         return advance
-    initial = drift.total(chain, state.displacement, state.velocity).detach()
+    initial = chain.energy(state.displacement, state.velocity).detach()
     # A stable step lets the energy of a mode swing by (w h)^2 / 4 over 1 minus that in Verlet's case; more is a drift.
     ratio = steps * highest_frequency(chain, initial_overlap(chain, state)) / composition.limit
     allowed = torch.where(ratio < 1, 0.1 + ratio**2 / (1 - ratio**2), 0.1)
@@ -158,7 +158,7 @@ def start(chain: Chain, state: State, composition: Composition, method: str, ste
 
     def guarded(times: Tensor) -> Trajectory:
         trajectory = advance(times)
-        drift.check(chain, trajectory, initial, allowed, remedy)
+        energy_guard.check(chain, trajectory, initial, allowed, remedy)
         return trajectory
 
     return guarded

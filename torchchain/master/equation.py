@@ -41,7 +41,7 @@ class MasterEquation(Printed, nn.Module):
 
     Args:
         model: the reduced model.
-        calibration: where it comes from.
+        calibration: where it comes from; None for a model of your own.
         uncertainty: standard errors by bootstrap; None if there are none.
     """
 
@@ -53,7 +53,7 @@ class MasterEquation(Printed, nn.Module):
         checks.instance("calibration", calibration, Calibration, type(None))
         checks.instance("uncertainty", uncertainty, Uncertainty, type(None))
         self.model = model
-        self.calibration = calibration
+        self.calibration = calibration or Calibration("given", "given", None)
         self.uncertainty = uncertainty
 
     @property
@@ -77,24 +77,20 @@ class MasterEquation(Printed, nn.Module):
     @property
     def damping(self) -> Tensor:
         """d [band], the dissipation rate of Eq. 51."""
-        loss = self._report.loss
+        loss = self.calibration.report.loss
         return self.model.damping if loss is None else torch.tensor(loss.rates).to(self.basis)
 
     @property
     def n_parameters(self) -> int:
         """Fitted numbers."""
-        if isinstance(self._report.fit, AnalyticReport):
+        if isinstance(self.calibration.report.fit, AnalyticReport):
             return 1
         return self.model.n_parameters
 
     @property
-    def _report(self) -> Report:
-        return Report() if self.calibration is None else self.calibration.report
-
-    @property
     def horizon(self) -> float:
         """Time up to which predictions were compared with chains; infinity where these had settled, or if unknown."""
-        return self._report.horizon
+        return self.calibration.report.horizon
 
     @property
     def n_bands(self) -> int:
@@ -102,8 +98,8 @@ class MasterEquation(Printed, nn.Module):
 
     def _rows(self) -> dict[str, str]:
         rows = {"bands": f"{self.n_bands}", "model": f"{self.model.kind}: {self.model.words}"}
-        if self.calibration is not None:
-            record, scene = self.calibration, self.calibration.scene
+        record, scene = self.calibration, self.calibration.scene
+        if record.method != "given":
             rows["model"] = f"{record.model}, fitted by {record.method}: {self.model.words}"
             rows["calibrated on"] = (
                 describe(scene) if scene is not None else record.provenance or "data without a scene"
@@ -111,7 +107,7 @@ class MasterEquation(Printed, nn.Module):
             rows["compared with chains"] = "at all times" if self.horizon == math.inf else f"up to t = {self.horizon:g}"
         if self.uncertainty is not None:
             rows["standard error"] = f"of a share of the energy at most {float(self.uncertainty.stderr.max()):.1e}"
-        selection = self._report.selection
+        selection = self.calibration.report.selection
         if selection is not None and selection.held_out_distance is not None:
             rows["held-out distance"] = (
                 f"{selection.held_out_distance:.4f}, of two halves {selection.halves_distance:.4f}"
@@ -241,7 +237,7 @@ class MasterEquation(Printed, nn.Module):
         strengths. The chain's length may change where the wave has not yet gone round: the rates belong to bands, not to tones.
         """
         checks.instance("scene", scene, Scene)
-        own = None if self.calibration is None else self.calibration.scene
+        own = self.calibration.scene
         end, found = float(scene.times[-1]), []
         if scene.n_bands != self.n_bands:
             found.append(f"bands {scene.n_bands}, calibrated on {self.n_bands}")
@@ -273,8 +269,7 @@ class MasterEquation(Printed, nn.Module):
             FieldError: for a number of bands that does not divide the present one, or a model without memory.
         """
         if not isinstance(self.model, MemoryModel):
-            name = self.model.kind if self.calibration is None else self.calibration.model
-            raise checks.fail("model", "be 'memory' to be coarsened", repr(name))
+            raise checks.fail("model", "be 'memory' to be coarsened", repr(self.calibration.model))
         n_bands = checks.integer("n_bands", n_bands, 1, self.n_bands)
         if self.n_bands % n_bands:
             raise checks.fail("n_bands", f"divide the {self.n_bands} bands of the model", n_bands)
@@ -285,18 +280,19 @@ class MasterEquation(Printed, nn.Module):
             tensors[name] = joined.T / size @ tensors[name] @ joined
         tensors["damping"] = tensors["damping"] @ joined / size
         record, errors = self.calibration, self.uncertainty
-        if record is not None:
-            record = replace(record, scene=_joined_scene(record.scene, n_bands), report=self._joined_report(joined))
+        record = replace(record, scene=_joined_scene(record.scene, n_bands), report=self._joined_report(joined))
         return MasterEquation(
             MemoryModel(**tensors), record, None if errors is None else errors.coarsened(joined.to(errors.stderr))
         )
 
     def _joined_report(self, joined: Tensor) -> Report:
-        loss = self._report.loss
+        loss = self.calibration.report.loss
         if loss is not None:
             rates = torch.tensor(loss.rates).to(joined) @ joined / joined.sum(0)
             loss = replace(loss, rates=tuple(rates.tolist()))
-        return Report(loss=loss, horizon=self.horizon, bootstrap=self._report.bootstrap, coarsened_from=self.n_bands)
+        return Report(
+            loss=loss, horizon=self.horizon, bootstrap=self.calibration.report.bootstrap, coarsened_from=self.n_bands
+        )
 
     def forward(self, initial: Tensor, times: Tensor) -> Tensor:
         """:meth:`solve` by the matrix exponential."""
@@ -317,10 +313,8 @@ class MasterEquation(Printed, nn.Module):
         """Write the model as safetensors, all or nothing.
 
         Raises:
-            FieldError: without a calibration, and where the file cannot be written.
+            FieldError: where the file cannot be written, and for a report whose numbers are not finite.
         """
-        if self.calibration is None:
-            raise checks.fail("calibration", "be there for a model to be saved", None)
         file.save((self.model, self.calibration, self.uncertainty), path)
 
     @classmethod

@@ -21,7 +21,7 @@ from torchchain.master import file
 from torchchain.master.calibration import calibrate
 from torchchain.master.equation import MasterEquation
 from torchchain.master.memory import MemoryModel
-from torchchain.master.report import Calibration, Loss, Report
+from torchchain.master.report import Loss, Report
 from torchchain.master.uncertainty import Uncertainty
 
 NEIGHBORS = 4
@@ -50,7 +50,6 @@ class MasterFamily(Printed):
             raise checks.fail("members", "be at least one master equation", 0)
         for member in members:
             checks.instance("members", member, MasterEquation)
-            checks.instance("members' calibration", member.calibration, Calibration)
             if member.calibration.scene is None:
                 raise checks.fail(
                     "members", "be calibrated on chains of a scene", member.calibration.provenance or "no scene"
@@ -60,7 +59,7 @@ class MasterFamily(Printed):
         for member in self.members:
             scene = scene_of(member)
             if not isinstance(member.model, MemoryModel):
-                raise checks.fail("members", "have the model 'memory'", repr(_record(member).model))
+                raise checks.fail("members", "have the model 'memory'", repr(member.calibration.model))
             for name in ("n_particles", "n_bands", "boundary", "contact", "damping", "stiffness_disorder"):
                 if getattr(scene, name) != getattr(first, name):
                     raise checks.fail(
@@ -108,10 +107,10 @@ class MasterFamily(Printed):
         if len(weights) == 1:  # a member's own strength
             return chosen[next(iter(weights))]
         parts = [(w, chosen[xi]) for xi, w in weights.items() if xi in chosen]
-        record = _record(parts[0][1])
+        record = parts[0][1].calibration
         scene = scene_of(parts[0][1])
         scene = replace(scene, disorder=replace(scene.disorder, strength=float(strength)))
-        losses = [(w, _record(m).report.loss) for w, m in parts]
+        losses = [(w, m.calibration.report.loss) for w, m in parts]
         report = Report(
             interpolated=tuple(weights.items()),
             horizon=min(member.horizon for _, member in parts),
@@ -145,7 +144,7 @@ class MasterFamily(Printed):
 
     def save(self, path: str | Path) -> None:
         """Write all members to one safetensors file, all or nothing."""
-        file.save_family([(m.model, _record(m), m.uncertainty) for m in self.members], path)
+        file.save_family([(m.model, m.calibration, m.uncertainty) for m in self.members], path)
 
     @classmethod
     def load(cls, path: str | Path) -> MasterFamily:
@@ -168,14 +167,9 @@ class MasterFamily(Printed):
         }
 
 
-def _record(member: MasterEquation) -> Calibration:
-    assert member.calibration is not None, "a family's constructor has checked it"
-    return member.calibration
-
-
 def scene_of(member: MasterEquation) -> Scene:
     """The scene that a member was calibrated on."""
-    scene = _record(member).scene
+    scene = member.calibration.scene
     assert scene is not None, "a family's constructor has checked it"
     return scene
 

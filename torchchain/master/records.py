@@ -137,6 +137,10 @@ class Recipe:
     settings: Any = NoSettings()
 
     @property
+    def model_name(self) -> str:
+        return self.model.name if self.model is not None else "chosen by calibrate"
+
+    @property
     def order(self) -> tuple[int, ...]:
         """Of a model that comes in several sizes; empty for others."""
         return tuple(getattr(self.settings, "order", None) or ())

@@ -46,7 +46,7 @@ def error(master: MasterEquation, scene: Scene) -> float | None:
     """
     if master.uncertainty is not None:
         return float(master.standard_error(starts(master, scene), scene.times).max())
-    selection = None if master.calibration is None else master.calibration.report.selection
+    selection = master.calibration.report.selection
     if selection is None or selection.held_out_distance is None or selection.halves_distance is None:
         return None
     held, halves = selection.held_out_distance, selection.halves_distance

@@ -100,24 +100,24 @@ def count_modes_below(chain: Chain, frequencies: Any) -> Tensor:
     checks.first_bad("frequencies", "not be negative", w, w < 0)
     if w.ndim != 1:
         raise checks.fail("frequencies", "be one-dimensional", f"shape {tuple(w.shape)}")
-    squared = w.square()
-    stiffness = chain.contact_stiffness
-    n = chain.n_particles
-    ring = chain.boundary == "periodic"
-    left = stiffness if ring else stiffness[..., :-1]
-    right = stiffness.roll(-1, -1) if ring else stiffness[..., 1:]
+    return negative_pivots(chain, w.square().expand(*chain.batch_shape, len(w)))
+
+
+def negative_pivots(chain: Chain, squared: Tensor) -> Tensor:
+    """Eigenvalues of -M^-1 K below each squared frequency (*batch, frequency) of its own chain, (*batch, frequency), int64."""
+    stiffness, n, ring = chain.contact_stiffness, chain.n_particles, chain.is_free
     tiny = torch.finfo(chain.masses.dtype).tiny ** 0.5
-    diagonal = (left + right)[..., None] - chain.masses[..., None] * squared  # (*batch, particle, frequency)
-    count = torch.zeros(*chain.batch_shape, len(w), dtype=torch.int64, device=chain.masses.device)
+    diagonal = chain.of_both_contacts(stiffness)[..., None] - chain.masses[..., None] * squared[..., None, :]
+    count = torch.zeros(squared.shape, dtype=torch.int64, device=squared.device)
     pivot = diagonal[..., 0, :]
-    closing = -left[..., 0, None].expand_as(pivot)  # coupling of the current particle to the last one of a ring
+    closing = -stiffness[..., 0, None].expand_as(pivot)  # coupling of the current particle to the last one of a ring
     last = diagonal[..., n - 1, :].clone()
     for i in range(1, n + 1):
         pivot = torch.where(pivot == 0, torch.full_like(pivot, -tiny), pivot)
         count += pivot < 0
         if i == n:
             break
-        coupling = -left[..., i, None]
+        coupling = -stiffness[..., i, None]
         if ring and i == n - 1:
             closing = closing + coupling
             pivot = last - closing.square() / pivot

@@ -14,12 +14,6 @@ class EnergyDriftError(RuntimeError):
     """A time integration whose energy left the allowed range: its step or tolerance is too large."""
 
 
-def total(chain: Chain, displacement: Tensor, velocity: Tensor) -> Tensor:
-    """Energy relative to the precompressed state, (*batch, *any, x) -> (*batch, *any)."""
-    kinetic = chain.align(chain.masses, velocity) * velocity.square()
-    return kinetic.sum(-1) / 2 + chain.contact_energy(displacement).sum(-1)
-
-
 def check(chain: Chain, trajectory: Trajectory, initial: Tensor, allowed: Tensor | float, remedy: str) -> None:
     """An error where the energy kept and dissipated differs from the initial one by more than the fraction allowed.
 
@@ -35,7 +29,7 @@ def check(chain: Chain, trajectory: Trajectory, initial: Tensor, allowed: Tensor
     """
     with torch.no_grad():
         allowed = torch.as_tensor(allowed, dtype=initial.dtype, device=initial.device).expand(initial.shape)
-        energy = total(chain, trajectory.displacement, trajectory.velocity)
+        energy = chain.energy(trajectory.displacement, trajectory.velocity)
         if trajectory.dissipated is not None:
             energy = energy + trajectory.dissipated
         drift = (energy - initial[..., None]).abs()

@@ -1,0 +1,23 @@
+"""Trajectories of other codes: LAMMPS, LIGGGHTS, MercuryDPM, extended XYZ."""
+
+from torchchain.frames.doubts import check_energy
+from torchchain.frames.formats import FORMATS
+from torchchain.frames.reading import Frames, convert, read_frames
+from torchchain.frames.record import Box, Contacts, Frame, FramesWarning, VectorTrajectory
+from torchchain.frames.registry import Format
+from torchchain.frames.units import ContactUnits
+
+__all__ = [
+    "FORMATS",
+    "Box",
+    "ContactUnits",
+    "Contacts",
+    "Format",
+    "Frame",
+    "Frames",
+    "FramesWarning",
+    "VectorTrajectory",
+    "check_energy",
+    "convert",
+    "read_frames",
+]

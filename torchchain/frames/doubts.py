@@ -1,0 +1,128 @@
+"""What makes a result doubtful: warnings of one line with file, frame and field."""
+
+from __future__ import annotations
+
+import math
+import sys
+import warnings
+
+import torch
+from torch import Tensor
+
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import Trajectory
+from torchchain.frames.record import AXES, Frame, FramesWarning
+
+DRIFT = 0.01  # share of the energy that an undamped run may gain or lose before a warning
+NOISE = 1e-3  # share of the displacement that the digits of the positions may leave out
+
+
+def warn(field: str, words: str) -> None:
+    """A warning of one line that begins with file, frame and field, shown at the caller's line."""
+    level, caller = 2, sys._getframe(1)
+    while caller.f_back is not None and caller.f_globals.get("__name__", "").startswith("torchchain."):
+        level, caller = level + 1, caller.f_back
+    warnings.warn(FramesWarning(" ".join(f"{field}: {words}".split())), stacklevel=level)
+
+
+def here(name: str, frame: Frame) -> str:
+    """File and frame, as errors begin."""
+    return f"{name}, frame {frame.number}"
+
+
+def significant_digits(values: Tensor) -> int:
+    """Decimal digits after which all values end, 5 to 12; 16 if they have more."""
+    values = values[values != 0].abs()
+    if not len(values):
+        return 16
+    rounding = 8 * torch.finfo(values.dtype).eps * values.max()
+    for digits in range(5, 13):
+        unit = 10.0 ** (values.log10().floor() - digits + 1)
+        if bool((((values / unit).round() * unit - values).abs() <= rounding).all()):
+            return digits
+    return 16
+
+
+def check_digits(name: str, frame: Frame, axes: list[str], moved: Tensor, length: float) -> None:
+    """A warning where the digits of the positions, or of their share of the box, are too few for the displacements."""
+    for column, axis in enumerate(axes):
+        size = float(moved[..., column].square().mean().sqrt()) * length
+        if not size > 0:
+            continue
+        positions = frame.positions[:, frame.axes.index(axis)] * length
+        written = [(positions, 1.0)]
+        if frame.box is not None:
+            i = AXES.index(axis)
+            low, side = frame.box.lower[i] * length, float(frame.box.lengths[i]) * length
+            written += [((positions - low) / side, side)] if side > 0 else []
+        for values, scale in written:
+            digits, largest = significant_digits(values), float(values.abs().max())
+            if digits > 12 or largest == 0:
+                continue
+            step = scale * 10.0 ** (math.floor(math.log10(largest)) - digits + 1)
+            error = step / math.sqrt(12)  # of a value that is rounded, rms
+            if error > NOISE * size:
+                warn(
+                    f"{here(name, frame)}: {axis}",
+                    f"positions of {digits} digits, in steps of {step / length:.2g}, for displacements of {size / length:.2g} (rms): off by {error / size:.1g} of themselves"
+                    " (LAMMPS: dump_modify ... format float %.15g)",
+                )
+                return
+
+
+def check_bounds(name: str, frame: Frame, axis: str, moved: Tensor, length: float) -> None:
+    """A warning where particles crossed a box whose bounds are rounded to six digits, as LIGGGHTS writes them."""
+    if frame.box is None:
+        return
+    size, i = float(moved.square().mean().sqrt()) * length, AXES.index(axis)
+    for bound in (frame.box.lower[i] * length, frame.box.upper[i] * length):
+        # Fewer digits are a round number, more are not rounded.
+        if f"{bound:.6g}" == f"{bound:.12g}" != f"{bound:.5g}":
+            error = 0.5 * 10.0 ** (math.floor(math.log10(abs(bound))) - 5)
+            if error > NOISE * size:
+                warn(
+                    f"{here(name, frame)}: box",
+                    f"the bound {bound / length:.6g} along {axis} has six digits: if it is rounded, displacements beyond it are off by up to {error / size:.1g} of their size {size / length:.2g} (dump {axis}u)",
+                )
+                return
+
+
+def check_across(name: str, frame: Frame, axis: str) -> None:
+    """A warning for motion across the axis of a chain."""
+    if frame.velocities is None or len(frame.axes) < 2:
+        return
+    square = frame.velocities.square().sum(0)
+    along, total = float(square[frame.axes.index(axis)]), float(square.sum())
+    if total > 0 and total - along > 1e-6 * total:
+        warn(
+            f"{here(name, frame)}: velocities",
+            f"{(total - along) / total:.2g} of the squares are across the chain's axis {axis}, and are left out",
+        )
+
+
+def check_energy(name: str, chain: Chain, path: Trajectory) -> None:
+    """Warnings for a motion that the chain does not make: energy that drifts without damping, contacts that open.
+
+    Args:
+        name: of the file, for the warnings.
+        chain: in the units of the trajectory.
+        path: (time, particle).
+    """
+    kinetic = (chain.masses * path.velocity.square()).sum(-1) / 2
+    total = kinetic + chain.contact_energy(path.displacement).sum(-1)
+    start = float(total[0])
+    if not chain.is_damped and start > 0:
+        change = (total / start - 1).abs()
+        if float(change.max()) > DRIFT:
+            k = int(change.argmax())
+            warn(
+                f"{name}, frame {k + 1}: energy",
+                f"{float(total[k] / start):.4g} of that of frame 1, for a chain without damping: damping or too long a time step there, or another stiffness than the chain's",
+            )
+    stretch = chain.elongation(path.displacement)
+    if float(stretch.max()) >= 1:
+        k = int(stretch.amax(-1).argmax())
+        warn(
+            f"{name}, frame {k + 1}: displacement",
+            f"above the overlap: a contact is stretched by {float(stretch.max()):.3g}, its initial overlap being 1 in the library's units",
+        )

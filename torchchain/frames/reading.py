@@ -1,0 +1,405 @@
+"""Trajectories of other codes, one frame in memory at a time."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import Trajectory
+from torchchain.frames import netcdf
+from torchchain.frames.building import build, kept, own_contacts
+from torchchain.frames.chains import chain as make_chain
+from torchchain.frames.doubts import check_energy, here
+from torchchain.frames.motion import displacements
+from torchchain.frames.opening import File, Place, Source, find, time_of
+from torchchain.frames.record import Box, Contacts, Frame, VectorTrajectory
+from torchchain.frames.registry import Entry, Raw
+from torchchain.frames.units import ContactUnits, fit_units, scaled_contacts
+
+
+def read_frames(
+    path: Source | Sequence[Source],
+    contacts: Source | Sequence[Source] | None = None,
+    format: str | None = None,
+    **options: Any,
+) -> Frames:
+    r"""Frames of a trajectory that another code wrote.
+
+    One pass looks at the headers and counts rows; positions are read when a frame is asked for.
+
+    Args:
+        path: a file, plain or gzip; a pattern such as "post/dump*.liggghts"; or a list of files, whose frames follow each other.
+        contacts: the same for contact lists (LAMMPS and LIGGGHTS dump local, MercuryDPM .fstat), matched by time step or time.
+        format: a name in ``torchchain.frames.FORMATS``; by default what the file begins with.
+        options:
+            time_step: time between two step numbers, for dumps without ITEM: TIME.
+            masses: where the file has none: a number, one for each id in ascending order, a dict from type to mass, or a
+                MercuryDPM .restart file.
+            density: masses from the radii: of spheres, or of disks where the file has two dimensions.
+            contact_columns: which columns of a contact list are which; see ``FORMATS[...].options``.
+            periodic: axes such as "x" or "xy" on which the box is periodic, where the file does not say.
+
+    Returns:
+        Frames, at least one.
+
+    Raises:
+        FieldError: in one line with file, frame and field, for a file that cannot be read or does not hold together.
+
+    Warns:
+        FramesWarning: for a last frame that is cut short, which is left out.
+
+    >>> from pathlib import Path
+    >>> from tempfile import mkdtemp
+    >>> frame = "ITEM: TIMESTEP\n{0}\nITEM: NUMBER OF ATOMS\n2\nITEM: ATOMS id mass xu vx\n1 0.9 0 {0}\n2 1.1 1 0\n"
+    >>> path = Path(mkdtemp(), "run.dump")
+    >>> written = path.write_text(frame.format(0) + frame.format(1))
+    >>> frames = read_frames(path, time_step=0.01)
+    >>> frames
+    Frames('run.dump', lammps: 2 frames of 2 particles)
+    >>> frames.chain("fixed").masses.tolist(), frames.trajectory().velocity.tolist()
+    ([0.9, 1.1], [[0.0, 0.0], [1.0, 0.0]])
+    >>> read_frames(convert(path, path.with_name("run.nc"), time_step=0.01))
+    Frames('run.nc', netcdf: 2 frames of 2 particles)
+    """
+    return Frames(*find(path, contacts, format, options))
+
+
+class Frames:
+    """The frames of a trajectory, read when they are asked for: iterate, index with a number, or take a slice.
+
+    What holds for all frames is that of the first: ids, masses, radii, box, contacts. Each frame is checked against it as
+    it is read. Units are the file's, or those of :meth:`scaled`.
+    """
+
+    def __init__(
+        self,
+        places: tuple[Place, ...],
+        options: dict[str, Any],
+        file_units: str | None = None,
+        scale: Any = None,
+        keep: Tensor | None = None,
+        first: Frame | None = None,
+    ) -> None:
+        self._places, self._options, self.file_units, self._scale, self._keep = places, options, file_units, scale, keep
+        self._origin = first if first is not None else self._read_first()
+        self._first: Frame | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the (first) file."""
+        return self._places[0].file.path.name
+
+    def __repr__(self) -> str:
+        form = self._places[0].file.format.name
+        return f"Frames({self.name!r}, {form}: {len(self)} frames of {len(self.ids)} particles)"
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> Frames: ...
+    def __getitem__(self, index: int | slice) -> Frame | Frames:
+        if isinstance(index, slice):
+            places = self._places[index]
+            if not places:
+                raise checks.fail(f"{self.name}: frames", f"be at least one of {len(self)}", str(index))
+            if index.step is not None and index.step < 0:
+                raise checks.fail(f"{self.name}: frames", "stay in their order", str(index))
+            return Frames(places, self._options, self.file_units, self._scale, self._keep, self._origin)
+        index = checks.integer(f"{self.name}: index", index, -len(self), len(self) - 1)
+        return next(self._frames([self._places[index]]))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._frames(self._places)
+
+    # What all frames share
+
+    @property
+    def first(self) -> Frame:
+        """The first frame, kept."""
+        if self._first is None:
+            self._first = self[0]
+        return self._first
+
+    @property
+    def times(self) -> Tensor:
+        """Time of every frame, (frame,).
+
+        Raises:
+            FieldError: where the file has only step numbers and no time step was given.
+        """
+        times = [time_of(place.entry, self._options) for place in self._places]
+        if any(time is None for time in times):
+            raise checks.fail(
+                f"{self.name}: TIME",
+                "be in the file (LAMMPS: dump_modify ... time yes) or follow from time_step=",
+                "none",
+            )
+        return torch.tensor(times, dtype=torch.float64) / self._unit("time")
+
+    @property
+    def steps(self) -> Tensor | None:
+        """Time step number of every frame, (frame,), or None."""
+        steps = [place.entry.step for place in self._places]
+        return None if steps[0] is None else torch.tensor(steps)
+
+    @property
+    def ids(self) -> Tensor:
+        """(particle,), ascending."""
+        return self.first.ids
+
+    @property
+    def masses(self) -> Tensor | None:
+        """(particle,), in the order of the ids, or None."""
+        return self.first.masses
+
+    @property
+    def radii(self) -> Tensor | None:
+        """(particle,), in the order of the ids, or None."""
+        return self.first.radii
+
+    @property
+    def box(self) -> Box | None:
+        """That of the first frame."""
+        return self.first.box
+
+    @property
+    def contacts(self) -> Contacts | None:
+        """Those of the first frame."""
+        return self.first.contacts
+
+    @property
+    def positions(self) -> Tensor:
+        """Of all frames, (frame, particle, axis): reads the whole file."""
+        return torch.stack([frame.positions for frame in self])
+
+    @property
+    def velocities(self) -> Tensor:
+        """Of all frames, (frame, particle, axis): reads the whole file."""
+        found = []
+        for frame in self:
+            if frame.velocities is None:
+                raise checks.fail(f"{here(self.name, frame)}: velocities", "be in the file", "none")
+            found.append(frame.velocities)
+        return torch.stack(found)
+
+    # Other views
+
+    def select(self, ids: Any) -> Frames:
+        """The same frames with these particles only: without walls made of particles, for instance.
+
+        Args:
+            ids: whole numbers, each in the file.
+        """
+        wanted = torch.as_tensor(ids).reshape(-1)
+        if wanted.is_floating_point() or wanted.dtype == torch.bool or not len(wanted):
+            raise checks.FieldTypeError(f"ids must be whole numbers, at least one, got {checks.shown(ids)}")
+        wanted = wanted.unique().to(torch.int64)
+        missing = wanted[~torch.isin(wanted, self.ids)]
+        if len(missing):
+            raise checks.fail("ids", f"be in {self.name}", int(missing[0]))
+        return Frames(self._places, self._options, self.file_units, self._scale, wanted, self._origin)
+
+    def scaled(self, units: Any) -> Frames:
+        """The same frames in other units.
+
+        Args:
+            units: what has ``unit(quantity)`` for "length", "time", "mass" and "force": a :class:`torchchain.Scaling`, for
+                files in SI units, or what :meth:`fit_units` gives.
+        """
+        if not callable(getattr(units, "unit", None)):
+            raise checks.FieldTypeError(f"units must be a Scaling or ContactUnits, got {checks.shown(units)}")
+        if self._scale is not None:
+            raise checks.fail("units", "be given once", "frames that are scaled already")
+        return Frames(self._places, self._options, self.file_units, units, self._keep, self._origin)
+
+    def fit_units(self, law: str = "hertz", reference: Frames | Frame | None = None) -> ContactUnits:
+        """Units in which mean mass, mean contact stiffness and mean overlap are 1, from the contact list of a state at rest.
+
+        Args:
+            law: "hertz", stiffness (3/2) F / overlap, or "linear", F / overlap.
+            reference: the state at rest; by default the first frame.
+        """
+        frame = reference[0] if isinstance(reference, Frames) else (reference or self.first)
+        return fit_units(self.name, frame, law)
+
+    # Chains
+
+    def chain(
+        self,
+        boundary: str = "periodic",
+        stiffness: Any = 1.0,
+        *,
+        axis: str | None = None,
+        contact: str = "linear",
+        damping: Any = 0.0,
+    ) -> Chain:
+        """The chain of these particles: their masses in their order along an axis.
+
+        Args:
+            boundary: "periodic" or "fixed".
+            stiffness: a number or (contact,); or "linear" or "hertz": from force and overlap in the contact list.
+            axis: "x", "y" or "z"; by default the one on which the particles form a line.
+            contact, damping: as for :class:`torchchain.Chain`.
+
+        Raises:
+            FieldError: without masses, for particles that form no line, for contacts between others than neighbors.
+
+        Warns:
+            FramesWarning: for a mean mass far from 1, and a box that is not periodic where the chain is.
+        """
+        return make_chain(self.name, self.first, boundary, stiffness, axis, contact, damping)
+
+    def trajectory(
+        self, reference: Source | Frames | Frame | None = None, *, axis: str | None = None, chain: Chain | None = None
+    ) -> Trajectory | VectorTrajectory:
+        """Displacements from a reference, across periodic boundaries, and velocities.
+
+        Args:
+            reference: the state without a wave: a file of one frame, frames or a frame; by default the first frame.
+            axis: "x", "y" or "z" for a chain along it; "all" for vectors, in the order of the ids; by default the axis on
+                which the particles form a line, "all" if they form none.
+            chain: if given, energy that drifts and contacts that open are looked for; see :func:`check_energy`.
+
+        Returns:
+            Trajectory with times counted from the first frame, and displacement and velocity (time, particle) in the order of
+            :meth:`chain`; or VectorTrajectory, (time, particle, axis).
+
+        Raises:
+            FieldError: for other particles than the reference's, for neighbors that pass each other, without velocities or times.
+
+        Warns:
+            FramesWarning: for displacements above the overlap, positions of too few digits, and motion across the chain.
+        """
+        at_rest, name = self._reference(reference)
+        found = displacements(self.name, self, len(self), self.first, at_rest, name, axis, self._unit("length"))
+        if chain is not None:
+            checks.instance("chain", chain, Chain)
+            if not isinstance(found, Trajectory) or chain.masses.shape != found.displacement.shape[-1:]:
+                raise checks.fail(
+                    "chain",
+                    f"have masses of shape {tuple(found.displacement.shape[1:])}",
+                    f"shape {tuple(chain.masses.shape)}",
+                )
+            check_energy(self.name, chain, found)
+        return found
+
+    def _reference(self, reference: Source | Frames | Frame | None) -> tuple[Frame, str]:
+        if reference is None:
+            return self.first, self.name
+        if isinstance(reference, Frame):
+            return reference, "reference"
+        if not isinstance(reference, Frames):
+            options = {name: value for name, value in self._options.items() if name == "periodic"}  # only where it is
+            reference = Frames(*find(reference, None, None, options), self._scale, self._keep)
+        if len(reference) != 1:
+            raise checks.fail(
+                f"{reference.name}: frames", "be one for a reference (choose it: read_frames(path)[-1])", len(reference)
+            )
+        return reference.first, reference.name
+
+    # Reading
+
+    def _unit(self, quantity: str) -> float:
+        return 1.0 if self._scale is None else float(self._scale.unit(quantity))
+
+    def _read_first(self) -> Frame:
+        return build(self._places[0], next(self._raws(self._places[:1])), None, None, self._options)
+
+    def _raws(self, places: Iterable[Place]) -> Iterator[Raw]:
+        """The frames as their files have them; each file is opened once for consecutive frames."""
+        for file, group in _groups([(place.file, place.entry) for place in places]):
+            yield from file.format.read(file.path, group, self._options)
+
+    def _frames(self, places: Sequence[Place]) -> Iterator[Frame]:
+        listed = [
+            (place.contact_file, place.contact_entry) for place in places if place.contact_file and place.contact_entry
+        ]
+        contacts = (raw for file, group in _groups(listed) for raw in file.format.read(file.path, group, self._options))
+        own: Iterator[Any] = iter(())
+        if places[0].file.format is netcdf.FORMAT and places[0].contact_file is None:
+            own = (
+                found
+                for file, group in _groups([(place.file, place.entry) for place in places])
+                for found in netcdf.read_contacts(file.path, group)
+            )
+        for place, raw in zip(places, self._raws(places), strict=True):
+            joined = next(contacts) if place.contact_entry is not None else None
+            yield self._view(build(place, raw, joined, self._origin, self._options), next(own, None))
+
+    def _view(self, frame: Frame, own: dict[str, np.ndarray] | None) -> Frame:
+        """The frame as this view shows it: its particles, its units."""
+        if own is not None:
+            frame = replace(frame, contacts=own_contacts(f"{self.name}, frame {frame.number}", own, len(frame.ids)))
+        if self._keep is not None:
+            frame = kept(frame, torch.searchsorted(frame.ids, self._keep))
+        if self._scale is None:
+            return frame
+        length, time, mass = self._unit("length"), self._unit("time"), self._unit("mass")
+        box = frame.box
+        if box is not None:
+            lower, upper = ([bound / length for bound in bounds] for bounds in (box.lower, box.upper))
+            box = Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]), box.periodic)
+        return replace(
+            frame,
+            time=None if frame.time is None else frame.time / time,
+            positions=frame.positions / length,
+            velocities=None if frame.velocities is None else frame.velocities * (time / length),
+            masses=None if frame.masses is None else frame.masses / mass,
+            radii=None if frame.radii is None else frame.radii / length,
+            box=box,
+            contacts=scaled_contacts(frame.contacts, length, self._unit("force")),
+        )
+
+
+def _groups(pairs: Sequence[tuple[Any, Any]]) -> Iterator[tuple[File, list[Entry]]]:
+    """Consecutive entries of one file together."""
+    begin = 0
+    for i in range(1, len(pairs) + 1):
+        if i == len(pairs) or pairs[i][0] is not pairs[begin][0]:
+            yield pairs[begin][0], [entry for _, entry in pairs[begin:i]]
+            begin = i
+
+
+def convert(
+    path: Source | Sequence[Source],
+    out: Source,
+    contacts: Source | Sequence[Source] | None = None,
+    format: str | None = None,
+    **options: Any,
+) -> Path:
+    """Write frames into one netCDF file that :func:`read_frames` reads many times faster than text.
+
+    Args:
+        path, contacts, format, options: as for :func:`read_frames`.
+        out: the file to be written; it appears when it is whole.
+
+    Returns:
+        The path of the new file.
+    """
+    frames = read_frames(path, contacts, format, **options)
+    target = Path(out)
+    if target.exists() and any(target.samefile(place.file.path) for place in frames._places):
+        raise checks.fail("out", "be another file than those read", str(target))
+    if target.is_dir() or not target.parent.is_dir():
+        raise checks.fail("out", "be a file in a folder that is there", str(target))
+    try:
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".convert-") as scratch:
+            part = Path(scratch) / "frames.nc"
+            netcdf.write(part, frames, frames.name, frames.file_units)
+            os.replace(part, target)
+    except OSError as error:
+        raise checks.fail("out", "be a file that can be written", f"{target}: {error.strerror or error}") from None
+    return target

@@ -1,0 +1,94 @@
+"""What a file of trajectories holds: one frame, its box and its contacts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+AXES = ("x", "y", "z")
+
+
+class FramesWarning(UserWarning):
+    """Something in a file that makes a result doubtful, with its file, frame and field."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box with sides along the axes, in the file's unit of length.
+
+    Attributes:
+        lower, upper: bounds along x, y, z.
+        periodic: whether what leaves on one side comes in on the other, for each axis.
+    """
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    periodic: tuple[bool, bool, bool]
+
+    @property
+    def lengths(self) -> Tensor:
+        """Lengths of the sides, (3,)."""
+        return torch.tensor(self.upper, dtype=torch.float64) - torch.tensor(self.lower, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """The contacts of one frame, each once.
+
+    Attributes:
+        pairs: positions in the frame's particles, counted from 0, (contact, 2), int64; -1 for a wall.
+        overlap: sum of radii less distance, (contact,), or None where the file does not say.
+        normal_force: repulsion, (contact,), or None.
+    """
+
+    pairs: Tensor
+    overlap: Tensor | None = None
+    normal_force: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """All particles at one instant, in ascending order of their ids, in the file's units.
+
+    Attributes:
+        number: of the frame in its source, counted from 1.
+        step: time step number, or None.
+        time: None where the file has only step numbers and no time step was given.
+        ids: (particle,), int64.
+        axes: the axes that the file holds, of "x", "y", "z".
+        positions: (particle, axis).
+        unwrapped: for each axis, whether the positions went on where a particle crossed the box.
+        velocities: (particle, axis), or None.
+        masses, radii: (particle,), or None.
+        box: or None.
+        contacts: or None.
+    """
+
+    number: int
+    step: int | None
+    time: float | None
+    ids: Tensor
+    axes: tuple[str, ...]
+    positions: Tensor
+    unwrapped: tuple[bool, ...]
+    velocities: Tensor | None = None
+    masses: Tensor | None = None
+    radii: Tensor | None = None
+    box: Box | None = None
+    contacts: Contacts | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class VectorTrajectory:
+    """Motion of particles that form no line, in the order of their ids.
+
+    Attributes:
+        times: (time,).
+        displacement, velocity: (time, particle, axis).
+    """
+
+    times: Tensor
+    displacement: Tensor
+    velocity: Tensor

@@ -1,0 +1,104 @@
+"""Masses and contact stiffnesses of a frame, and the units that they set."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.frames.doubts import here
+from torchchain.frames.record import Contacts, Frame
+
+LAWS = ("linear", "hertz")
+
+
+@dataclass(frozen=True)
+class ContactUnits:
+    """Units in which the mean mass, the mean contact stiffness and the mean overlap are 1.
+
+    Has ``unit(quantity)`` like :class:`torchchain.Scaling`.
+
+    Attributes:
+        mass, stiffness, length: in the file's units; positive.
+    """
+
+    mass: float
+    stiffness: float
+    length: float
+
+    def __post_init__(self) -> None:
+        for field in ("mass", "stiffness", "length"):
+            object.__setattr__(self, field, checks.number(f"units.{field}", getattr(self, field), above=0.0))
+
+    def unit(self, quantity: str) -> float:
+        """The file's value of the dimensionless 1 of a quantity."""
+        time = math.sqrt(self.mass / self.stiffness)
+        known = {
+            "time": time, "length": self.length, "velocity": self.length / time, "mass": self.mass, "stiffness": self.stiffness,
+            "force": self.stiffness * self.length, "energy": self.stiffness * self.length**2,
+        }  # fmt: skip
+        return known[checks.choice("quantity", quantity, known)]
+
+
+def finite_masses(name: str, frame: Frame) -> Tensor:
+    """The masses, (particle,); an error that says where they could come from if there are none."""
+    if frame.masses is None:
+        raise checks.fail(
+            f"{here(name, frame)}: masses",
+            "be in the file (LAMMPS: the column mass; MercuryDPM: the .restart beside it) or be given by masses= or, with radii, density=", "none",
+        )  # fmt: skip
+    fixed = frame.masses.isinf()
+    if bool(fixed.any()):
+        raise checks.fail(
+            f"{here(name, frame)}: masses",
+            "be finite (leave out fixed particles with frames.select)",
+            f"a fixed particle, id {int(frame.ids[fixed][0])}",
+        )
+    return frame.masses
+
+
+def contact_stiffness(name: str, frame: Frame, law: str) -> Tensor:
+    """Slope of the force at each contact of the frame, (contact,): F / overlap, or (3/2) F / overlap of a Hertz contact."""
+    checks.choice("law", law, LAWS)
+    contacts = frame.contacts
+    if contacts is None:
+        raise checks.fail(
+            f"{here(name, frame)}: contacts",
+            "be read with the frames (read_frames(..., contacts=)) for their stiffness",
+            "none",
+        )
+    for field in ("overlap", "normal_force"):
+        values = getattr(contacts, field)
+        if values is None:
+            raise checks.fail(f"{here(name, frame)}: {field}", "be in the contact list for its stiffness", "none")
+        if bool((values <= 0).any()):
+            raise checks.fail(
+                f"{here(name, frame)}: {field}",
+                "be positive at every contact for its stiffness",
+                f"{float(values[values <= 0][0]):g}",
+            )
+    assert contacts.overlap is not None
+    assert contacts.normal_force is not None
+    return (1.5 if law == "hertz" else 1.0) * contacts.normal_force / contacts.overlap
+
+
+def fit_units(name: str, frame: Frame, law: str) -> ContactUnits:
+    """Units from the masses and contacts of a frame at rest; see :meth:`Frames.fit_units`."""
+    stiffness = contact_stiffness(name, frame, law)
+    masses = finite_masses(name, frame)
+    assert frame.contacts is not None
+    assert frame.contacts.overlap is not None
+    if not len(stiffness):
+        raise checks.fail(f"{here(name, frame)}: contacts", "be at least one for units", "none")
+    return ContactUnits(float(masses.mean()), float(stiffness.mean()), float(frame.contacts.overlap.mean()))
+
+
+def scaled_contacts(contacts: Contacts | None, length: float, force: float) -> Contacts | None:
+    """Overlaps and forces in other units."""
+    if contacts is None:
+        return None
+    overlap = None if contacts.overlap is None else contacts.overlap / length
+    normal = None if contacts.normal_force is None else contacts.normal_force / force
+    return Contacts(contacts.pairs, overlap, normal)

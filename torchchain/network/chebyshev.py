@@ -1,0 +1,474 @@
+"""Chebyshev propagation of networks: exact to rounding, by products with the bonds alone.
+
+The expansion of a chain (:mod:`torchchain.evolvers.chebyshev`, whose coefficients serve here) needs nothing of the
+chain but its force and a bound W^2 that no squared frequency exceeds:
+
+    u(t) = sum_k [c_k T_k u + s_k T_k v],    v(t) = sum_k [c_k T_k v + d_k T_k u],    T_k = T_k(1 - 2 M^-1 K / W^2).
+
+On the CPU the kernels of :mod:`torchchain.network.kernels` do it, in float64; elsewhere, and where gradients are asked
+for, plain torch. Outputs that follow a state closely share one recursion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix, csgraph
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import State
+from torchchain.evolvers.chebyshev import check_work
+from torchchain.evolvers.coefficients import coefficients_of
+from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS
+from torchchain.evolvers.method import Advance, Method
+from torchchain.modes import phase
+from torchchain.network.lattices import PRIMITIVE, STEPS, Lattice
+from torchchain.network.modes import check_stability, exceeds
+from torchchain.network.networks import Network
+from torchchain.network.trajectories import NetworkTrajectory
+
+TILE = 512  # particles whose terms are added to the sums while they are in cache
+SPLIT = 20_000  # unknowns from which the threads share one network
+RENUMBER = 2_000  # particles from which a network is renumbered for the cache
+PAD = 1
+
+
+def start(
+    network: Network,
+    state: State,
+    accuracy: float = 1e-12,
+    bound: float | Tensor | None = None,
+    compiled: bool | None = None,
+) -> Advance:
+    """See the registry entry below.
+
+    Raises:
+        FieldError: for an option out of range.
+        UnstableError: for a network that is not stable.
+    """
+    accuracy = checks.number("accuracy", accuracy, above=0, at_most=0.1)
+    tolerance = max(accuracy / SEGMENTS, ROUNDING)
+    check_stability(network)
+    frequency = highest_frequency(network, bound)
+    possible = _compilable(network, state)
+    if compiled is None:
+        compiled = possible
+    elif checks.truth("compiled", compiled) and not possible:
+        raise checks.fail("compiled", "be False for tensors off the CPU or that require gradients", compiled)
+    if compiled:
+        return CompiledAdvance(network, state, frequency, tolerance)
+    return _plain(network, state, frequency, tolerance)
+
+
+def _compilable(network: Network, state: State) -> bool:
+    values = (network.masses, network.stiffness, network.tension, network.positions, state.displacement, state.velocity)
+    tensors = [torch.as_tensor(x) for x in values]
+    return all(x.device.type == "cpu" and not (x.requires_grad and torch.is_grad_enabled()) for x in tensors)
+
+
+def highest_frequency(network: Network, bound: float | Tensor | None = None) -> Tensor:
+    """W, at least the highest frequency of each network, (*batch,), float64.
+
+    Args:
+        network: any.
+        bound: of the squared frequency, a number or (*batch,); by default the network's own, which is rigorous.
+
+    Raises:
+        FieldError: if a squared frequency exceeds the ``bound``, which would make states grow without limit.
+    """
+    with torch.no_grad():
+        if bound is None:
+            squared = network.squared_frequency_bound()
+        else:
+            squared = checks.real_tensor("bound", bound).to(network.masses.device, torch.float64)
+            checks.first_bad("bound", "be positive", squared, squared <= 0)
+            if squared.shape not in (torch.Size(), network.batch_shape):
+                raise checks.fail(
+                    "bound", f"be a number or have shape {tuple(network.batch_shape)}", f"shape {tuple(squared.shape)}"
+                )
+            squared = squared.expand(network.batch_shape)
+            exceeded = torch.zeros(network.batch_shape, dtype=torch.bool, device=squared.device)
+            for member in np.ndindex(*network.batch_shape):
+                exceeded[member] = exceeds(network, float(squared[member]), member)
+            rule = "not lie below the largest squared frequency (network.squared_frequency_bound() never does)"
+            checks.first_bad("bound", rule, squared, exceeded, "network")
+        frequency = squared.clamp(min=1e-300).sqrt().cpu().numpy()  # no bonds: any W will do
+        mantissa, exponent = np.frexp(frequency)  # rounded up to 24 bits, so that W^2 is exact
+        return torch.as_tensor(np.ldexp(np.ceil(mantissa * 2**24) / 2**24, exponent), device=squared.device)
+
+
+def _later(times: Tensor, now: float) -> list[float]:
+    """The times as numbers, none before those of the last window."""
+    if bool(times[0] < now):
+        raise checks.fail("times", f"not go back behind the last window's end {now:g}", times[0].item())
+    return times.detach().to("cpu", torch.float64).tolist()
+
+
+def _plain(network: Network, state: State, frequency: Tensor, tolerance: float) -> Advance:
+    """The expansion in plain torch, from each output time to the next."""
+    axis = len(network.batch_shape)
+    pair = torch.stack([state.displacement, state.velocity], dim=axis)
+    frequencies = frequency.reshape(-1).cpu().numpy()
+    weight = 1 / network.align(network.masses, pair)
+    weight = weight * network.align((4 / frequency.square()).to(network.masses)[..., None], pair)
+    now = 0.0
+
+    def step(pair: Tensor, interval: np.ndarray) -> Tensor:
+        table = torch.from_numpy(coefficients_of(frequencies, interval, tolerance)).to(pair)
+        table = table.reshape(*table.shape[:2], *network.batch_shape, *[1] * (pair.ndim - axis - 1))
+        older, old = pair, pair + weight / 2 * network.force(pair)
+        total: list[Tensor] = []
+        for k in range(table.shape[1]):
+            if k > 1:
+                older, old = old, 2 * old - older + weight * network.force(old)
+            displacement, velocity = (pair if k == 0 else old).unbind(axis)
+            cosine, integral, derivative = table[:, k]
+            terms = [cosine * displacement + integral * velocity, cosine * velocity + derivative * displacement]
+            total = [a + b for a, b in zip(total, terms, strict=True)] if total else terms
+        return torch.stack(total, dim=axis)
+
+    def advance(times: Tensor) -> NetworkTrajectory:
+        nonlocal pair, now
+        check_work(times, frequencies.max())
+        phase.check(times, frequency, pair.dtype)
+        outputs = []
+        for t in _later(times, now):
+            leaps = np.ceil(frequencies * (t - now) / LEAP)
+            for leap in range(int(leaps.max())):
+                pair = step(pair, np.where(leap < leaps, (t - now) / np.maximum(leaps, 1), 0.0))
+            now = t
+            outputs.append(pair)
+        displacement, velocity = torch.stack(outputs, dim=-3).unbind(axis)
+        return NetworkTrajectory(times, displacement, velocity)
+
+    return advance
+
+
+class Layout(Protocol):
+    """Numbers of one network laid out for a kernel."""
+
+    parts: int
+
+    def cells(self, fields: list[np.ndarray]) -> np.ndarray:
+        """Scratch with T_0 in it, from fields (particle, component)."""
+
+    def sums(self, outputs: int) -> np.ndarray:
+        """Zeros for the sums."""
+
+    def bind(self, member: int, frequency: float) -> Callable[..., None]:
+        """The kernel with the numbers of a member of the batch: called with steps, last, begin, end, cells, sums, table."""
+
+    def read(self, sums: np.ndarray) -> np.ndarray:
+        """The sums as (output, 2, particle, component)."""
+
+
+class Gathered:
+    """Neighbors listed for every particle; particles renumbered so that neighbors are near each other in memory."""
+
+    def __init__(self, network: Network) -> None:
+        n, c = network.n_particles, network.n_components
+        bonds = network.bonds.cpu().numpy()
+        b = np.arange(len(bonds))
+        owner, end = np.concatenate([bonds[:, 0], bonds[:, 1]]), np.concatenate([bonds[:, 1], bonds[:, 0]])
+        bond = np.concatenate([b, b])
+        inside = owner < n
+        owner, end, bond = owner[inside], np.minimum(end[inside], n), bond[inside]  # cell n is every anchor, at rest
+        self.order = np.arange(n)
+        if n > RENUMBER:
+            near = end < n
+            graph = coo_matrix((np.ones(near.sum(), np.int8), (owner[near], end[near])), shape=(n, n)).tocsr()
+            self.order = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
+        place = np.empty(n + 1, np.int64)
+        place[self.order], place[n] = np.arange(n), n
+        owner, end = place[owner], place[end]
+        sort = np.lexsort((end, owner))
+        self.ends, self.bond = end[sort], bond[sort]
+        self._offsets: dict[int, np.ndarray] = {}
+        self.starts = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=n))]).astype(np.uint64)
+        self.parts, self.components = n, c
+        self.masses = _flat(network.masses)[:, self.order]
+        self.stiffness = _flat(network.bond_stiffness)
+        self.across = _flat(network.bond_tension / network.lengths) if network.is_prestressed else None
+        directions = network.directions.detach().double().cpu().numpy()
+        self.directions = directions[self.bond] if c > 1 else np.zeros(0)
+
+    def _ends(self, columns: int) -> np.ndarray:
+        """The neighbors as offsets into cells with so many columns."""
+        if columns not in self._offsets:
+            kind = np.uint32 if (self.parts + 1) * columns < 2**32 else np.uint64
+            self._offsets[columns] = (self.ends * columns).astype(kind)
+        return self._offsets[columns]
+
+    def cells(self, fields: list[np.ndarray]) -> np.ndarray:
+        cells = np.zeros((2, self.parts + 1, len(fields) * self.components))
+        for r, values in enumerate(fields):
+            cells[0, :-1, r * self.components : (r + 1) * self.components] = values[self.order]
+        return cells
+
+    def sums(self, outputs: int) -> np.ndarray:
+        return np.zeros((outputs, 2, self.parts, self.components))
+
+    def bind(self, member: int, frequency: float) -> Callable[..., None]:
+        from torchchain.network import kernels  # imports Numba
+
+        weight = 4 / frequency**2 / self.masses[member]
+        stiff, across, directions = self.stiffness[member][self.bond], np.zeros(0), self.directions
+        if self.components > 1:
+            if self.across is not None:
+                across = self.across[member][self.bond]
+                stiff = stiff - across
+            directions = (directions * np.sqrt(np.abs(stiff))[:, None]).reshape(-1)
+            stiff = np.sign(stiff) if stiff.min(initial=0) < 0 else np.zeros(0)
+
+        def run(
+            steps: tuple[int, int],
+            last: int,
+            begin: int,
+            end: int,
+            cells: np.ndarray,
+            sums: np.ndarray,
+            table: np.ndarray,
+        ) -> None:
+            keep = np.empty((TILE, cells.shape[2]))
+            kernels.gathered(
+                steps, last, begin, end, TILE, cells, weight, self.starts, self._ends(cells.shape[2]), stiff, directions,
+                across, cells.shape[2] // self.components, keep, sums, table,
+            )  # fmt: skip
+
+        return run
+
+    def read(self, sums: np.ndarray) -> np.ndarray:
+        out = np.empty_like(sums)
+        out[:, :, self.order] = sums
+        return out
+
+
+class Rows:
+    """Rows of a lattice, whose neighbors are rows."""
+
+    def __init__(self, network: Lattice) -> None:
+        *front, self.width = network.shape
+        self.parts = math.prod(front)
+        self.components, n = network.n_components, network.n_particles
+        primitive, half = np.array(PRIMITIVE[network.kind]), np.array(STEPS[network.kind])
+        steps = np.concatenate([half, -half])
+        rows = np.stack(np.unravel_index(np.arange(self.parts), front), axis=1) if front else np.zeros((1, 0), np.int64)
+        self.neighbors = np.empty((self.parts, len(steps)), np.int64)
+        for s, step in enumerate(steps):
+            there, at_rest = rows + step[:-1], np.zeros(self.parts, bool)
+            for a, extent in enumerate(front):
+                if network.boundary[a] == "periodic":
+                    there[:, a] %= extent
+                else:
+                    at_rest |= (there[:, a] < 0) | (there[:, a] >= extent)
+            number = np.ravel_multi_index(tuple(there.clip(0).T % np.array(front)[:, None]), front) if front else 0
+            self.neighbors[:, s] = np.where(at_rest, self.parts, number)
+        self.shifts = steps[:, -1].astype(np.int64)
+        self.wrap = network.boundary[-1] == "periodic"
+        vectors = steps @ primitive
+        directions = vectors if self.components > 1 else np.ones((len(steps), 1))
+        # No step of these lattices has three components: the two largest, the second perhaps zero.
+        self.axes = np.argsort(-np.abs(directions), axis=1, kind="stable")[:, :2]
+        self.axes = self.axes if self.components > 1 else np.zeros((len(steps), 2), np.int64)
+        self.ratios = np.take_along_axis(directions, self.axes, axis=1)
+        self.ratios[np.abs(self.ratios) < 1e-12] = 0.0
+        if self.components == 1:
+            self.ratios[:, 1] = 0.0
+        self.masses = _flat(network.masses)
+        self.stiffness = _flat(network.bond_stiffness)
+        prestressed = network.is_prestressed and self.components > 1
+        self.across = _flat(network.bond_tension / network.lengths) if prestressed else None
+        bonds, way = network.bonds.cpu().numpy(), network.steps.cpu().numpy()
+        inside = bonds[:, 1] < n
+        opposite = (way + len(half)) % len(steps)
+        self.slot = np.concatenate([way * n + bonds[:, 0], (opposite * n + bonds[:, 1])[inside]])
+        self.bond = np.concatenate([np.arange(len(bonds)), np.flatnonzero(inside)])
+        self.full = len(self.slot) == n * len(steps)
+
+    def _slots(self, values: np.ndarray) -> np.ndarray:
+        """Values per bond as (step, row, width), or (step, 1, 1) where all are equal."""
+        steps = len(self.shifts)
+        if self.full and values.min() == values.max():
+            return np.full((steps, 1, 1), values[0])
+        slots = np.zeros(steps * self.parts * self.width)
+        slots[self.slot] = values[self.bond]
+        return slots.reshape(steps, self.parts, self.width)
+
+    def cells(self, fields: list[np.ndarray]) -> np.ndarray:
+        c, w = self.components, self.width
+        cells = np.zeros((2, len(fields) * c, self.parts + 1, w + 2 * PAD))
+        for r, values in enumerate(fields):
+            inner = cells[0, r * c : (r + 1) * c, :-1]
+            inner[..., PAD:-PAD] = values.T.reshape(c, self.parts, w)
+            if self.wrap:
+                inner[..., :PAD] = inner[..., w : w + PAD]
+                inner[..., -PAD:] = inner[..., PAD : 2 * PAD]
+        return cells
+
+    def sums(self, outputs: int) -> np.ndarray:
+        return np.zeros((outputs, 2, self.components, self.parts, self.width))
+
+    def bind(self, member: int, frequency: float) -> Callable[..., None]:
+        from torchchain.network import kernels  # imports Numba
+
+        weight = (4 / frequency**2 / self.masses[member]).reshape(self.parts, self.width)
+        stiff, across = self._slots(self.stiffness[member]), np.zeros((0, 1, 1))
+        if self.across is not None:
+            across = self._slots(self.across[member])
+            stiff, across = (np.ascontiguousarray(x) for x in np.broadcast_arrays(stiff - across, across))
+
+        def run(
+            steps: tuple[int, int],
+            last: int,
+            begin: int,
+            end: int,
+            cells: np.ndarray,
+            sums: np.ndarray,
+            table: np.ndarray,
+        ) -> None:
+            force, keep = np.empty((2, self.width))
+            pulls = np.empty((len(self.shifts), self.width))
+            kernels.rows(
+                steps, last, begin, end, cells, weight, self.neighbors, self.shifts, stiff, self.axes, self.ratios, across,
+                PAD, cells.shape[1] // self.components, self.components, self.wrap, pulls, force, keep, sums, table,
+            )  # fmt: skip
+
+        return run
+
+    def read(self, sums: np.ndarray) -> np.ndarray:
+        return np.moveaxis(sums, 2, -1).reshape(len(sums), 2, -1, self.components)
+
+
+def layout_of(network: Network) -> Layout:
+    """The fastest layout that the network has."""
+    if isinstance(network, Lattice) and network.n_bonds and _is_straight(network):
+        return Rows(network)
+    return Gathered(network)
+
+
+def _is_straight(network: Lattice) -> bool:
+    """Whether the bonds have the directions of the lattice: its positions have not been moved."""
+    vectors = torch.tensor(STEPS[network.kind]).to(network.primitive) @ network.primitive
+    vectors = torch.cat([vectors, -vectors])[network.steps]
+    return bool((network.bond_vectors - vectors).abs().max() < 1e-9)
+
+
+def _flat(values: Tensor) -> np.ndarray:
+    return values.detach().double().reshape(-1, values.shape[-1]).cpu().numpy()
+
+
+class CompiledAdvance:
+    """The expansion by the kernels, in float64 whatever the dtype of the state."""
+
+    def __init__(self, network: Network, state: State, frequency: Tensor, tolerance: float) -> None:
+        self.layout = layout_of(network)
+        self.frequencies = frequency.reshape(-1).cpu().numpy()
+        self.tolerance = tolerance
+        self._shape, self._dtype = state.displacement.shape, state.displacement.dtype
+        n, c = self._shape[-2:]
+        pair = torch.stack([state.displacement.detach(), state.velocity.detach()], dim=-3)
+        self._anchors = pair.double().reshape(-1, 2, n, c).numpy()
+        self._starts = len(self._anchors) // max(len(self.frequencies), 1)
+        self._unknowns = n * c
+        self._kernels: dict[int, Callable[..., None]] = {}
+        self._now = 0.0
+
+    def __call__(self, times: Tensor) -> NetworkTrajectory:
+        check_work(times, float(self.frequencies.max()))
+        phase.check(times, torch.from_numpy(self.frequencies), torch.float64)
+        later = _later(times, self._now)
+        rows = len(self._anchors)
+        n, c = self._shape[-2:]
+        out = torch.empty((2, rows, len(later), n, c), dtype=self._dtype)
+        anchors = np.empty_like(self._anchors)
+        threads = torch.get_num_threads()
+
+        def one(row: int, pool: ThreadPoolExecutor | None) -> None:
+            anchors[row] = self._march(row, later, out[:, row], pool, threads)
+
+        if threads == 1 or (rows == 1 and self._unknowns < SPLIT):
+            for row in range(rows):
+                one(row, None)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                if rows >= threads or self._unknowns < SPLIT:
+                    list(pool.map(lambda row: one(row, None), range(rows)))
+                else:
+                    for row in range(rows):
+                        one(row, pool)
+        self._anchors, self._now = anchors, later[-1]
+        displacement, velocity = out.reshape(2, *self._shape[:-2], len(later), n, c)
+        return NetworkTrajectory(times, displacement, velocity)
+
+    def _march(
+        self, row: int, times: list[float], out: Tensor, pool: ThreadPoolExecutor | None, threads: int
+    ) -> np.ndarray:
+        """Writes the states of a row at the times, and returns the last in float64."""
+        member = row // self._starts
+        w = float(self.frequencies[member])
+        run = self.layout.bind(member, w)
+        state, now, done = self._anchors[row], self._now, 0
+        while done < len(times):
+            if times[done] == now:
+                out[:, done] = torch.from_numpy(state)
+                done += 1
+                continue
+            count = 1
+            while count < LONGEST and done + count < len(times) and w * (times[done + count] - now) <= REACH:
+                count += 1
+            leaps = max(1, math.ceil(w * (times[done] - now) / LEAP)) if count == 1 else 1
+            for leap in range(1, leaps + 1):
+                share = [(t - now) * leap / leaps - (t - now) * (leap - 1) / leaps for t in times[done : done + count]]
+                states = self._expand(run, state, w, np.array(share), pool, threads)
+                state = states[-1]
+            out[:, done : done + count] = torch.from_numpy(states).transpose(0, 1)
+            now, done = times[done + count - 1], done + count
+        return state
+
+    def _expand(
+        self, run: Callable[..., None], state: np.ndarray, w: float, intervals: np.ndarray, pool: Any, threads: int
+    ) -> np.ndarray:
+        """States (output, 2, particle, component) at some intervals after a state."""
+        cosine, integral, derivative = coefficients_of(np.full(len(intervals), w), intervals, self.tolerance)
+        kinds = [kind for kind in (0, 1) if state[kind].any()] or [0]
+        count = max(2, len(cosine))
+        table = np.zeros((len(intervals), count, 2, len(kinds)))  # (output, term, displacement or velocity, field)
+        for r, kind in enumerate(kinds):
+            for to, factor in enumerate((cosine, derivative) if kind == 0 else (integral, cosine)):
+                table[:, : len(factor), to, r] = factor.T
+        cells, sums = self.layout.cells([state[kind] for kind in kinds]), self.layout.sums(len(intervals))
+        last, parts = count - 1, self.layout.parts
+        if pool is None:
+            run((1, count), last, 0, parts, cells, sums, table)
+        else:
+            cuts = [parts * i // threads for i in range(threads + 1)]
+            for k in range(1, count):
+                list(
+                    pool.map(
+                        lambda i, k=k: run((k, k + 1), last, cuts[i], cuts[i + 1], cells, sums, table), range(threads)
+                    )
+                )
+        return self.layout.read(sums)
+
+
+METHOD = Method(
+    name="chebyshev",
+    start=start,
+    summary="Chebyshev expansion of the exact solution in powers of M^-1 K, by the bonds alone",
+    order="exact to the accuracy asked for, at any output time",
+    conserves="energy and, without anchors, momentum, to the accuracy",
+    stability="unconditional: the spectrum lies below a rigorous bound; networks that are not stable are refused",
+    cost="about W t / 2 products with the bonds and some sums per output (W: the bound); memory of a few states",
+    cannot="damping, contacts that open",
+    options={
+        "accuracy": "what truncation may leave out, relative to the size of the state, over 1024 segments (1e-12)",
+        "bound": "squared frequency that no mode exceeds, a number or (*batch,); by default a rigorous one",
+        "compiled": "False for the plain torch implementation on the CPU, too",
+    },
+)

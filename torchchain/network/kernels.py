@@ -1,0 +1,541 @@
+"""Chebyshev recursions on networks: the Numba kernels behind :mod:`torchchain.network.chebyshev`.
+
+With x = 1 - 2 M^-1 K / W^2, each kernel computes T_k = 2 x T_k-1 - T_k-2 on some of the particles, in place of T_k-2,
+and on every third step adds three terms to the sums for the outputs, whose T it has at hand. Every particle gathers the
+pulls of its own bonds, so that threads share no cell and the result does not depend on their number.
+
+Two layouts: *gathered*, the neighbors of every particle listed, for any network; and *rows*, for lattices, where the
+neighbors of a row of particles are rows, the loops run along them, and nothing need be looked up.
+
+Importing this file imports Numba.
+"""
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+_U = np.uint64
+
+
+@_kernel
+def _gathered_1_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for one component of one field; ``ends`` are offsets into ``now``."""
+    for p in range(_U(begin), _U(end)):
+        at = _U(1) * p
+        x0 = now[at]
+        fx0 = 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            k = stiff[s]
+            fx0 += k * (now[q] - x0)
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+
+
+@_kernel
+def _gathered_1_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for one component of two fields; ``ends`` are offsets into ``now``."""
+    for p in range(_U(begin), _U(end)):
+        at = _U(2) * p
+        x0, x1 = now[at], now[at + _U(1)]
+        fx0, fx1 = 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            k = stiff[s]
+            fx0 += k * (now[q] - x0)
+            fx1 += k * (now[q + _U(1)] - x1)
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = x1 + 0.5 * w * fx1
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fx1 + (2.0 * x1 - old[at + _U(1)])
+
+
+@_kernel
+def _gathered_2_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for two components of one field; ``ends`` are offsets into ``now``."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        at = _U(2) * p
+        x0, y0 = now[at], now[at + _U(1)]
+        fx0, fy0 = 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            nx, ny = directions[_U(2) * s], directions[_U(2) * s + _U(1)]
+            dx0 = now[q] - x0
+            dy0 = now[q + _U(1)] - y0
+            pull0 = nx * dx0 + ny * dy0
+            if signed:
+                pull0 *= stiff[s]
+            fx0 += nx * pull0
+            fy0 += ny * pull0
+            if prestressed:
+                t = across[s]
+                fx0 += t * dx0
+                fy0 += t * dy0
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = y0 + 0.5 * w * fy0
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
+
+
+@_kernel
+def _gathered_2_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for two components of two fields; ``ends`` are offsets into ``now``."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        at = _U(4) * p
+        x0, y0, x1, y1 = now[at], now[at + _U(1)], now[at + _U(2)], now[at + _U(3)]
+        fx0, fy0, fx1, fy1 = 0.0, 0.0, 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            nx, ny = directions[_U(2) * s], directions[_U(2) * s + _U(1)]
+            dx0 = now[q] - x0
+            dy0 = now[q + _U(1)] - y0
+            pull0 = nx * dx0 + ny * dy0
+            dx1 = now[q + _U(2)] - x1
+            dy1 = now[q + _U(3)] - y1
+            pull1 = nx * dx1 + ny * dy1
+            if signed:
+                pull0 *= stiff[s]
+                pull1 *= stiff[s]
+            fx0 += nx * pull0
+            fy0 += ny * pull0
+            fx1 += nx * pull1
+            fy1 += ny * pull1
+            if prestressed:
+                t = across[s]
+                fx0 += t * dx0
+                fy0 += t * dy0
+                fx1 += t * dx1
+                fy1 += t * dy1
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = y0 + 0.5 * w * fy0
+            old[at + _U(2)] = x1 + 0.5 * w * fx1
+            old[at + _U(3)] = y1 + 0.5 * w * fy1
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
+            old[at + _U(2)] = w * fx1 + (2.0 * x1 - old[at + _U(2)])
+            old[at + _U(3)] = w * fy1 + (2.0 * y1 - old[at + _U(3)])
+
+
+@_kernel
+def _gathered_3_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for three components of one field; ``ends`` are offsets into ``now``."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        at = _U(3) * p
+        x0, y0, z0 = now[at], now[at + _U(1)], now[at + _U(2)]
+        fx0, fy0, fz0 = 0.0, 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            nx, ny, nz = directions[_U(3) * s], directions[_U(3) * s + _U(1)], directions[_U(3) * s + _U(2)]
+            dx0 = now[q] - x0
+            dy0 = now[q + _U(1)] - y0
+            dz0 = now[q + _U(2)] - z0
+            pull0 = nx * dx0 + ny * dy0 + nz * dz0
+            if signed:
+                pull0 *= stiff[s]
+            fx0 += nx * pull0
+            fy0 += ny * pull0
+            fz0 += nz * pull0
+            if prestressed:
+                t = across[s]
+                fx0 += t * dx0
+                fy0 += t * dy0
+                fz0 += t * dz0
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = y0 + 0.5 * w * fy0
+            old[at + _U(2)] = z0 + 0.5 * w * fz0
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
+            old[at + _U(2)] = w * fz0 + (2.0 * z0 - old[at + _U(2)])
+
+
+@_kernel
+def _gathered_3_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
+    """One step for three components of two fields; ``ends`` are offsets into ``now``."""
+    prestressed, signed = len(across) > 0, len(stiff) > 0
+    for p in range(_U(begin), _U(end)):
+        at = _U(6) * p
+        x0, y0, z0, x1, y1, z1 = (
+            now[at],
+            now[at + _U(1)],
+            now[at + _U(2)],
+            now[at + _U(3)],
+            now[at + _U(4)],
+            now[at + _U(5)],
+        )
+        fx0, fy0, fz0, fx1, fy1, fz1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+            q = _U(ends[s])
+            nx, ny, nz = directions[_U(3) * s], directions[_U(3) * s + _U(1)], directions[_U(3) * s + _U(2)]
+            dx0 = now[q] - x0
+            dy0 = now[q + _U(1)] - y0
+            dz0 = now[q + _U(2)] - z0
+            pull0 = nx * dx0 + ny * dy0 + nz * dz0
+            dx1 = now[q + _U(3)] - x1
+            dy1 = now[q + _U(4)] - y1
+            dz1 = now[q + _U(5)] - z1
+            pull1 = nx * dx1 + ny * dy1 + nz * dz1
+            if signed:
+                pull0 *= stiff[s]
+                pull1 *= stiff[s]
+            fx0 += nx * pull0
+            fy0 += ny * pull0
+            fz0 += nz * pull0
+            fx1 += nx * pull1
+            fy1 += ny * pull1
+            fz1 += nz * pull1
+            if prestressed:
+                t = across[s]
+                fx0 += t * dx0
+                fy0 += t * dy0
+                fz0 += t * dz0
+                fx1 += t * dx1
+                fy1 += t * dy1
+                fz1 += t * dz1
+        w = weight[p]
+        if first:
+            old[at] = x0 + 0.5 * w * fx0
+            old[at + _U(1)] = y0 + 0.5 * w * fy0
+            old[at + _U(2)] = z0 + 0.5 * w * fz0
+            old[at + _U(3)] = x1 + 0.5 * w * fx1
+            old[at + _U(4)] = y1 + 0.5 * w * fy1
+            old[at + _U(5)] = z1 + 0.5 * w * fz1
+        else:
+            old[at] = w * fx0 + (2.0 * x0 - old[at])
+            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
+            old[at + _U(2)] = w * fz0 + (2.0 * z0 - old[at + _U(2)])
+            old[at + _U(3)] = w * fx1 + (2.0 * x1 - old[at + _U(3)])
+            old[at + _U(4)] = w * fy1 + (2.0 * y1 - old[at + _U(4)])
+            old[at + _U(5)] = w * fz1 + (2.0 * z1 - old[at + _U(5)])
+
+
+@_kernel
+def _terms(k, last, table):
+    """How many of T_k-2, T_k-1, T_k are added at step k, and their factors (output, 3, 2, field)."""
+    count = 3 if k % 3 == 2 else (k % 3 + 1 if k == last else 0)
+    terms = np.zeros((len(table), 3, 2, table.shape[3]))
+    for back in range(count):
+        terms[:, 2 - back] = table[:, k - back]
+    return count, terms
+
+
+@_kernel
+def gathered(
+    steps, last, begin, end, tile, cells, weight, starts, ends, stiff, directions, across, fields, keep, sums, table
+):
+    """Some steps on particles begin to end - 1, a tile at a time, the sums added to while the tile is in cache.
+
+    Args:
+        steps: the steps k, as a range (first, after the last); step k makes T_k of T_k-1 and T_k-2.
+        last: the last step of all, at which the terms not yet added are.
+        tile: particles treated at a time.
+        cells: (2, particle, column), T_k in cells[k % 2].
+        weight: 4 / (W^2 m), (particle,).
+        starts, ends: neighbors of particle p are ends[starts[p] : starts[p + 1]], as offsets into the flat cells.
+        stiff, directions, across: of each of these bonds, with one component its k; with more the sign of k - T / L
+            (empty where none is negative), n times the root of its size (slot and component,), and T / L (empty without tension).
+        fields: T u, T v, or both: columns are (field, component).
+        keep: scratch (tile, column).
+        sums: (output, 2, particle, component), displacement and velocity.
+        table: (output, term, 2, field), what each T of each field contributes to displacement and velocity.
+    """
+    columns = cells.shape[2]
+    components = columns // fields
+    for k in range(steps[0], steps[1]):
+        old, now = cells[k % 2], cells[(k + 1) % 2]
+        to, of = old.reshape(-1), now.reshape(-1)
+        count, terms = _terms(k, last, table)
+        for low in range(begin, end, tile):
+            high = min(low + tile, end)
+            if count:
+                for p in range(low, high):
+                    for c in range(columns):
+                        keep[p - low, c] = old[p, c]
+            first = k == 1
+            if components == 1 and fields == 1:
+                _gathered_1_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 1 and fields == 2:
+                _gathered_1_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 2 and fields == 1:
+                _gathered_2_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 2 and fields == 2:
+                _gathered_2_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 3 and fields == 1:
+                _gathered_3_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            elif components == 3 and fields == 2:
+                _gathered_3_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
+            if count:
+                _add(low, high, keep, old, now, fields, sums, terms)
+
+
+@_kernel
+def _add(low, high, keep, new, now, fields, sums, terms):
+    components = new.shape[1] // fields
+    for j in range(len(terms)):
+        for r in range(fields):
+            a0, a1, a2 = terms[j, 0, 0, r], terms[j, 1, 0, r], terms[j, 2, 0, r]
+            b0, b1, b2 = terms[j, 0, 1, r], terms[j, 1, 1, r], terms[j, 2, 1, r]
+            if a0 == 0 and a1 == 0 and a2 == 0 and b0 == 0 and b1 == 0 and b2 == 0:
+                continue
+            for p in range(low, high):
+                for c in range(components):
+                    q = r * components + c
+                    t0, t1, t2 = keep[p - low, q], now[p, q], new[p, q]
+                    sums[j, 0, p, c] += a0 * t0 + a1 * t1 + a2 * t2
+                    sums[j, 1, p, c] += b0 * t0 + b1 * t1 + b2 * t2
+
+
+@_kernel
+def rows(
+    steps, last, begin, end, cells, weight, neighbors, shifts, stiff, axes, parts, across, pad, fields, components,
+    wrap, pulls, force, keep, sums, table,
+):  # fmt: skip
+    """Some steps on rows begin to end - 1 of a lattice.
+
+    Each loop runs along a row and writes one array: with more, the compiler's tests for overlapping arrays become so
+    many that it gives up vectorizing.
+
+    Args:
+        steps, last, fields, table: as for :func:`gathered`.
+        cells: (2, field and component, row, width + 2 pad), T_k in cells[k % 2]; the pads hold copies of the other end,
+            or walls at rest; the last row, beyond those of the lattice, is at rest.
+        weight: (row, width).
+        neighbors: of each row by each lattice step, (row, step); the second half of the steps are opposite to the first.
+        shifts: along the row by each lattice step, (step,).
+        stiff: k - T / L, (step, 1, 1) for equal bonds, else (step, row, width), zero where there is no bond.
+        axes, parts: the two components of each step's direction that are not zero, (step, 2), and their values; the
+            second value is zero where only one is not.
+        across: T / L in the shape of ``stiff``; empty without tension.
+        wrap: whether the rows are rings.
+        pulls: scratch (step, width).
+        force: scratch (width,).
+        keep: scratch (width,).
+        sums: (output, 2, component, row, width).
+    """
+    varied = stiff.shape[1] * stiff.shape[2] > 1
+    half = len(shifts) // 2
+    used = len(shifts) if varied else half
+    width = len(force)
+    for k in range(steps[0], steps[1]):
+        old, now = cells[k % 2], cells[(k + 1) % 2]
+        count, terms = _terms(k, last, table)
+        for row in range(begin, end):
+            for r in range(fields):
+                base = components * r
+                for s in range(used):
+                    a, b = base + axes[s, 0], base + axes[s, 1]
+                    x, y, there, shift = now[a, row], now[b, row], neighbors[row, s], pad + shifts[s]
+                    x2, y2 = now[a, there, shift:], now[b, there, shift:]
+                    m, n = parts[s, 0], parts[s, 1]
+                    if varied and n == 0:
+                        _pull_one(pulls[s], x[pad:], x2, stiff[s, row], m, width)
+                    elif varied:
+                        _pull_two(pulls[s], x[pad:], x2, y[pad:], y2, stiff[s, row], m, n, width)
+                    else:
+                        back, shift = neighbors[row, s + half], pad + shifts[s + half]
+                        x3, y3, stiffness = now[a, back, shift:], now[b, back, shift:], stiff[s, 0, 0]
+                        if n == 0:
+                            _bend_one(pulls[s], x[pad:], x2, x3, stiffness * m, width)
+                        else:
+                            _bend_two(pulls[s], x[pad:], x2, x3, y[pad:], y2, y3, stiffness * m, stiffness * n, width)
+                for c in range(components):
+                    q = base + c
+                    new, x = old[q, row], now[q, row]
+                    force[:] = 0.0
+                    for s in range(used):
+                        for e in range(2):
+                            if axes[s, e] == c and parts[s, e] != 0:
+                                _scale_add(force, pulls[s], parts[s, e], width)
+                    if len(across):
+                        for s in range(used):
+                            x2 = now[q, neighbors[row, s], pad + shifts[s] :]
+                            if varied:
+                                _pull_across(force, x[pad:], x2, across[s, row], width)
+                            else:
+                                x3 = now[q, neighbors[row, s + half], pad + shifts[s + half] :]
+                                _bend_across(force, x[pad:], x2, x3, across[s, 0, 0], width)
+                    if count:
+                        keep[:] = new[pad : pad + width]
+                    _close(new[pad:], x[pad:], force, weight[row], width, k == 1)
+                    if wrap:
+                        for i in range(pad):
+                            new[i] = new[width + i]
+                            new[pad + width + i] = new[pad + i]
+                    if count:
+                        for j in range(len(terms)):
+                            for kind in range(2):
+                                f0, f1, f2 = terms[j, 0, kind, r], terms[j, 1, kind, r], terms[j, 2, kind, r]
+                                if f0 != 0 or f1 != 0 or f2 != 0:
+                                    _add_row(sums[j, kind, c, row], keep, x[pad:], new[pad:], f0, f1, f2, width)
+
+
+@_kernel
+def _pull_one(pull, x, x2, stiff, m, width):
+    for i in range(_U(width)):
+        pull[i] = stiff[i] * (m * (x2[i] - x[i]))
+
+
+@_kernel
+def _pull_two(pull, x, x2, y, y2, stiff, m, n, width):
+    for i in range(_U(width)):
+        pull[i] = stiff[i] * (m * (x2[i] - x[i]) + n * (y2[i] - y[i]))
+
+
+@_kernel
+def _bend_one(pull, x, x2, x3, m, width):
+    for i in range(_U(width)):
+        pull[i] = m * ((x2[i] - x[i]) + (x3[i] - x[i]))
+
+
+@_kernel
+def _bend_two(pull, x, x2, x3, y, y2, y3, m, n, width):
+    for i in range(_U(width)):
+        pull[i] = m * ((x2[i] - x[i]) + (x3[i] - x[i])) + n * ((y2[i] - y[i]) + (y3[i] - y[i]))
+
+
+@_kernel
+def _pull_across(force, x, x2, across, width):
+    for i in range(_U(width)):
+        force[i] += across[i] * (x2[i] - x[i])
+
+
+@_kernel
+def _bend_across(force, x, x2, x3, across, width):
+    for i in range(_U(width)):
+        force[i] += across * ((x2[i] - x[i]) + (x3[i] - x[i]))
+
+
+@_kernel
+def _scale_add(force, pull, m, width):
+    for i in range(_U(width)):
+        force[i] += m * pull[i]
+
+
+@_kernel
+def _close(new, now, force, weight, width, first):
+    if first:
+        for i in range(_U(width)):
+            new[i] = now[i] + 0.5 * weight[i] * force[i]
+    else:
+        for i in range(_U(width)):
+            new[i] = weight[i] * force[i] + (2.0 * now[i] - new[i])
+
+
+@_kernel
+def _add_row(total, keep, now, new, a, b, c, width):
+    for i in range(_U(width)):
+        total[i] += a * keep[i] + b * now[i] + c * new[i]
+
+
+@_kernel
+def squared_bound(bonds, blocks, own, masses, sweeps):
+    """See :meth:`torchchain.network.networks.Network.squared_frequency_bound`; blocks and own without signs."""
+    n, c = own.shape[0], own.shape[1]
+    x, image = np.ones((n, c)), np.empty((n, c))
+    largest = 0.0
+    for _ in range(sweeps + 1):
+        for p in range(n):
+            for a in range(c):
+                image[p, a] = 0.0
+                for b in range(c):
+                    image[p, a] += own[p, a, b] * x[p, b]
+        for e in range(len(bonds)):
+            i, j = bonds[e, 0], bonds[e, 1]
+            if i >= n or j >= n:
+                continue
+            for a in range(c):
+                for b in range(c):
+                    image[i, a] += blocks[e, a, b] * x[j, b]
+                    image[j, a] += blocks[e, a, b] * x[i, b]
+        largest, top = 0.0, 0.0
+        for p in range(n):
+            for a in range(c):
+                ratio = image[p, a] / masses[p] / x[p, a]
+                largest = max(largest, ratio)
+                x[p, a] = np.sqrt(x[p, a] * x[p, a] * ratio)
+                top = max(top, x[p, a])
+        scale = 1.0 / max(top, 1e-300)
+        for p in range(n):
+            for a in range(c):
+                x[p, a] = max(x[p, a] * scale, 1e-60)
+    return largest
+
+
+@_kernel
+def grain_force(x, radii, pairs, shifts, hertz, modulus, damping, velocity, force):
+    """Contact forces between grains at x, (particle, component), written to ``force``.
+
+    Args:
+        pairs: (pair, 2); the second grain is taken at its center plus the pair's shift (pair, component).
+        damping: of the change of length of a closed contact; 0 for none.
+    """
+    d = x.shape[1]
+    force[:] = 0.0
+    for e in range(len(pairs)):
+        i, j = pairs[e, 0], pairs[e, 1]
+        square = 0.0
+        for a in range(d):
+            r = x[j, a] - x[i, a] + shifts[e, a]
+            square += r * r
+        reach = radii[i] + radii[j]
+        if square >= reach * reach:
+            continue
+        length = np.sqrt(square)
+        overlap = reach - length
+        push = modulus * overlap
+        if hertz:
+            push *= np.sqrt(overlap) * (2.0 / 3.0)
+        if damping > 0:
+            rate = 0.0
+            for a in range(d):
+                rate += (velocity[j, a] - velocity[i, a]) * (x[j, a] - x[i, a] + shifts[e, a]) / length
+            push -= damping * rate
+        for a in range(d):
+            f = push * (x[j, a] - x[i, a] + shifts[e, a]) / length
+            force[i, a] -= f
+            force[j, a] += f
+
+
+@_kernel
+def grain_steps(x, v, masses, radii, pairs, shifts, hertz, modulus, damping, step, count, origin, limit, force):
+    """Velocity Verlet steps, at most ``count``, until a grain is ``limit`` away from ``origin``; how many were made.
+
+    ``force`` holds that of the state at hand on entry and on return.
+    """
+    n, d = x.shape
+    for made in range(count):
+        far = 0.0
+        for p in range(n):
+            moved = 0.0
+            for a in range(d):
+                v[p, a] += 0.5 * step / masses[p] * force[p, a]
+                x[p, a] += step * v[p, a]
+                moved += (x[p, a] - origin[p, a]) ** 2
+            far = max(far, moved)
+        grain_force(x, radii, pairs, shifts, hertz, modulus, damping, v, force)
+        for p in range(n):
+            for a in range(d):
+                v[p, a] += 0.5 * step / masses[p] * force[p, a]
+        if far > limit * limit:
+            return made + 1
+    return count

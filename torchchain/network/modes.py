@@ -1,0 +1,254 @@
+"""Normal modes of networks by batched eigen-decomposition; zero modes; stability."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import csgraph, csr_matrix, diags, identity
+from scipy.sparse import linalg as sparse_linalg
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.network.networks import Network
+from torchchain.network.packings import rattlers
+
+MOST_UNKNOWNS = 20_000  # of a dense decomposition
+MOST_DENSE = 1500  # unknowns up to which stability is looked up in all eigenvalues
+MOST_FACTORED = 10**6  # unknowns up to which it is looked up in a sparse factorization
+
+
+class FloppyWarning(UserWarning):
+    """A network with more zero modes than its rigid motions."""
+
+
+class UnstableError(checks.FieldError):
+    """A network whose prestress makes a squared frequency negative."""
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkModes:
+    """Normal modes of a network.
+
+    Attributes:
+        frequencies: (*batch, mode), ascending; exactly zero for zero modes.
+        shapes: (*batch, particle, component, mode), with unit modal mass: sum of m |s|^2 over the particles is 1.
+    """
+
+    frequencies: Tensor
+    shapes: Tensor
+
+    @property
+    def n_zero(self) -> Tensor:
+        """Zero modes of each network, (*batch,)."""
+        return (self.frequencies == 0).sum(-1)
+
+
+@dataclass(frozen=True)
+class Softness:
+    """Why a network has zero modes.
+
+    Attributes:
+        zero_modes: all of them.
+        rigid: motions of the whole that no bond feels: translations, and rotations of what is free to turn.
+        components: pieces not connected by bonds.
+        rattlers: loose particles; see :func:`torchchain.network.rattlers`.
+    """
+
+    zero_modes: int
+    rigid: int
+    components: int
+    rattlers: int
+
+    @property
+    def floppy(self) -> int:
+        return self.zero_modes - self.rigid
+
+    def __str__(self) -> str:
+        return (
+            f"{self.zero_modes} zero modes, {self.rigid} of them rigid motions of the whole; "
+            f"{self.components} connected {'piece' if self.components == 1 else 'pieces'}, {self.rattlers} rattlers"
+        )
+
+
+def normal_modes(network: Network) -> NetworkModes:
+    """Normal modes of a network (or of a packing about its state).
+
+    Decomposes M^-1/2 K M^-1/2, all networks of a batch at once, and takes each w^2 anew from the mode's bonds, sum of
+    e . C e, which is accurate relative to w itself where the solver's is accurate only relative to the largest.
+
+    >>> import torch
+    >>> from torchchain.network import lattice
+    >>> normal_modes(lattice("chain", (4,))).frequencies.round(decimals=6)
+    tensor([0.0000, 1.4142, 1.4142, 2.0000], dtype=torch.float64)
+
+    Args:
+        network: without damping; n_particles * n_components unknowns.
+
+    Returns:
+        NetworkModes, dtype and device of the masses.
+
+    Raises:
+        UnstableError: naming the lowest squared frequency, if it is negative beyond rounding.
+        FieldError: for a damped network, or one too large to decompose.
+
+    Warns:
+        FloppyWarning: for zero modes besides the rigid motions of the whole, counting them.
+    """
+    checks.instance("network", network, Network)
+    n, c = network.n_particles, network.n_components
+    if network.is_damped:
+        raise checks.fail("damping", "be zero for normal modes (use evolve's method 'damped')", "more")
+    if n * c > MOST_UNKNOWNS:
+        raise checks.fail(
+            "network",
+            f"have at most {MOST_UNKNOWNS} unknowns for all modes (use method 'chebyshev' or spectral moments)",
+            n * c,
+        )
+    weight = network.masses.rsqrt().repeat_interleave(c, dim=-1)
+    squared, vectors = torch.linalg.eigh(network.stiffness_matrix() * weight[..., :, None] * weight[..., None, :])
+    shapes = (vectors * weight[..., :, None]).unflatten(-2, (n, c))
+    fields = shapes.movedim(-1, -3)  # (*batch, mode, particle, component)
+    elongation = network.elongation(fields)
+    refined = (network.bond_force(elongation) * elongation).sum((-2, -1))
+    eps = torch.finfo(squared.dtype).eps
+    limit = 4 * n * c * eps * squared.detach().abs().amax(-1, keepdim=True)
+    slipped = ((refined - squared).detach().abs() > limit).any(-1)
+    if bool(slipped.any()):
+        where = tuple(int(i) for i in slipped.nonzero()[0])
+        raise RuntimeError(f"the eigen-solver's modes must satisfy their equation, got others{checks.position(where)}")
+    lowest = refined.detach().amin(-1)
+    if bool((lowest < -limit[..., 0]).any()):
+        where = tuple(int(i) for i in (lowest < -limit[..., 0]).nonzero()[0])
+        raise _unstable(lowest[where].item(), int((refined[where] < -limit[where]).sum()), where)
+    zero = refined.detach() <= limit
+    refined = torch.where(zero, 1.0, refined).sqrt()
+    frequencies = torch.where(zero, 0.0, refined)
+    frequencies, order = frequencies.sort(dim=-1)
+    shapes = shapes.gather(-1, order[..., None, None, :].expand(shapes.shape))
+    modes = NetworkModes(frequencies, shapes)
+    _warn_if_floppy(network, int(modes.n_zero.max()))
+    return modes
+
+
+def _unstable(squared: float, count: int | None, where: tuple[int, ...] = ()) -> UnstableError:
+    several = "" if count is None else f", one of {count} below zero" if count > 1 else ""
+    return UnstableError(
+        f"tension must leave every squared frequency positive or zero, got {squared:.6g}{several}{checks.position(where)}"
+    )
+
+
+def _warn_if_floppy(network: Network, zero_modes: int) -> None:
+    if zero_modes > rigid_motions(network):
+        soft = describe_softness(network, zero_modes)
+        warnings.warn(f"the network has {soft}", FloppyWarning, stacklevel=3)
+
+
+def softness(network: Network) -> Softness:
+    """Zero modes of a network and where they come from; for a batch, of the softest member.
+
+    >>> from torchchain.network import lattice
+    >>> print(softness(lattice("square", (4, 4))))
+    8 zero modes, 2 of them rigid motions of the whole; 1 connected piece, 0 rattlers
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FloppyWarning)
+        zero_modes = int(normal_modes(network).n_zero.max())
+    return describe_softness(network, zero_modes)
+
+
+def describe_softness(network: Network, zero_modes: int) -> Softness:
+    """The record for a number of zero modes that is known."""
+    loose = int(rattlers(network).sum())
+    return Softness(zero_modes, rigid_motions(network), len(set(components(network).tolist())), loose)
+
+
+def components(network: Network) -> Tensor:
+    """Number of the connected piece that each particle belongs to, counted from 0, (particle,); anchors are one body."""
+    n = network.n_particles
+    bonds = network.bonds.cpu().numpy()
+    held = (torch.as_tensor(network.stiffness).detach() > 0).reshape(-1, network.n_bonds).any(0).cpu().numpy()
+    i, j = np.minimum(bonds, n).T[:, held] if len(bonds) else np.zeros((2, 0), np.int64)
+    graph = csr_matrix((np.ones(len(i)), (i, j)), shape=(n + 1, n + 1))
+    _, label = csgraph.connected_components(graph, directed=False)
+    _, label = np.unique(label[:n], return_inverse=True)
+    return torch.from_numpy(label.reshape(-1)).to(network.bonds.device)
+
+
+def rigid_motions(network: Network) -> int:
+    """How many independent motions of the whole network change no bond: 0 if it is anchored.
+
+    Translations, and rotations in the planes of two directions that are not periodic.
+    """
+    if network.n_anchors:
+        return 0
+    if network.motion == "scalar":
+        return 1
+    d, n = network.dimension, network.n_particles
+    box = network.box
+    # A skewed cell couples its axes: nothing turns.
+    is_open = [True] * d if box is None else [box.ndim == 1 and not bool(b) for b in box.isfinite().reshape(-1)[:d]]
+    x = network.positions.detach().double().cpu().numpy()
+    x = x - x.mean(0)
+    size = np.abs(x).max() or 1.0
+    motions = []
+    for a in range(d):
+        for b in range(a + 1, d):
+            if is_open[a] and is_open[b]:
+                turn = np.zeros((n, d))
+                turn[:, a], turn[:, b] = x[:, b] / size, -x[:, a] / size
+                motions.append(turn.reshape(-1))
+    return d + (int(np.linalg.matrix_rank(np.stack(motions), tol=1e-9 * n**0.5)) if motions else 0)
+
+
+def check_stability(network: Network) -> None:
+    """An error that names the lowest squared frequency where pushing bonds make it negative.
+
+    Only bonds with negative tension can. Small networks are decomposed, larger ones factored sparsely, whose negative
+    pivots count the negative eigenvalues (Sylvester's law of inertia).
+
+    Raises:
+        UnstableError: if a squared frequency lies below -1e-10 of the largest possible.
+    """
+    if network.motion == "scalar" or not bool((torch.as_tensor(network.tension).detach() < 0).any()):
+        return
+    bounds = network.squared_frequency_bound()
+    for member in np.ndindex(*network.batch_shape):
+        matrix = network.sparse_stiffness(member)
+        masses = network.masses.detach()[member].double().cpu().numpy().repeat(network.n_components)
+        weight = diags(masses**-0.5)
+        matrix = (weight @ matrix @ weight).tocsc()
+        slack = 1e-10 * float(bounds[member])
+        if len(masses) <= MOST_DENSE:
+            values = np.linalg.eigvalsh(matrix.toarray())
+            if values[0] < -slack:
+                raise _unstable(float(values[0]), int((values < -slack).sum()), member)
+            continue
+        if len(masses) > MOST_FACTORED:
+            continue
+        negative = _negative_pivots(matrix + slack * identity(len(masses), format="csc"))
+        if negative:
+            lowest = sparse_linalg.eigsh(
+                matrix, k=1, which="SA", return_eigenvectors=False, tol=1e-3, v0=np.cos(np.arange(1.0, 1 + len(masses)))
+            )
+            raise _unstable(float(lowest[0]), negative, member)
+
+
+def exceeds(network: Network, squared: float, member: tuple[int, ...] = ()) -> bool:
+    """Whether a squared frequency of one network of the batch exceeds a number by more than rounding.
+
+    None does exactly where the number times M, less K, has no negative eigenvalue.
+    """
+    masses = network.masses.detach()[member].double().cpu().numpy().repeat(network.n_components)
+    matrix = squared * (1 + 1e-10) * diags(masses) - network.sparse_stiffness(member)
+    return _negative_pivots(matrix.tocsc()) > 0
+
+
+def _negative_pivots(matrix: csr_matrix) -> int:
+    """Negative eigenvalues of a symmetric matrix, by elimination without exchange of rows."""
+    factors = sparse_linalg.splu(
+        matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return int((factors.U.diagonal() < 0).sum())

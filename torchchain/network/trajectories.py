@@ -1,0 +1,36 @@
+"""States of networks in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import State
+from torchchain.chain.states import Trajectory
+from torchchain.network.networks import Network
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkTrajectory(Trajectory):
+    """States of networks in time: displacement and velocity (*batch, *any, time, particle, component)."""
+
+    @property
+    def final(self) -> State:
+        """The state at the last time."""
+        return State(self.displacement[..., -1, :, :], self.velocity[..., -1, :, :])
+
+
+def check_trajectory(network: Network, trajectory: Trajectory) -> tuple[Tensor, Tensor]:
+    """Displacement and velocity, if they are states in time of this network."""
+    checks.instance("network", network, Network)
+    checks.instance("trajectory", trajectory, Trajectory)
+    network.check_state(trajectory.displacement)
+    if trajectory.displacement.ndim < len(network.batch_shape) + 3:
+        raise checks.fail(
+            "trajectory",
+            "have the axes (*batch, time, particle, component)",
+            f"shape {tuple(trajectory.displacement.shape)}",
+        )
+    return trajectory.displacement, trajectory.velocity

@@ -1,0 +1,207 @@
+"""Velocity Verlet for networks: linear bonds, and grains whose contacts open, close and turn."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import State
+from torchchain.evolvers.method import Advance, Method
+from torchchain.network.networks import Network
+from torchchain.network.packings import Packing, contact_law, near_pairs
+from torchchain.network.trajectories import NetworkTrajectory
+
+SHARE = 0.1  # of 1 / W: the default step
+SKIN = 0.2  # of the largest radius: pairs are listed up to gaps of that
+
+
+def start(network: Network, state: State, step: float | None = None, linear: bool | None = None) -> Advance:
+    """See the registry entry below.
+
+    Raises:
+        FieldError: for a step at or beyond the stability limit, 2 / W.
+    """
+    grains = isinstance(network, Packing) and not (linear is not None and checks.truth("linear", linear))
+    if linear is False and not grains:
+        raise checks.fail("linear", "be True or None for a network that is no packing", linear)
+    with torch.no_grad():
+        top = network.squared_frequency_bound().sqrt().amax().item()
+    rate = _damping_rate(network)
+    if step is None:
+        step = SHARE / max(top, rate, 1e-300)
+    step = checks.number("step", step, above=0)
+    if step * top >= 2 or step * rate >= 2:
+        raise checks.fail(
+            "step", f"be less than {2 / max(top, rate):.6g}, the stability limit of method 'verlet'", step
+        )
+    if grains:
+        assert isinstance(network, Packing)
+        return _grains(network, state, step)
+    return _linear(network, state, step)
+
+
+def _damping_rate(network: Network) -> float:
+    """A bound on the eigenvalues of M^-1 D."""
+    with torch.no_grad():
+        if not network.is_damped:
+            return 0.0
+        ends = network.bond_damping
+        total = ends.new_zeros(*network.batch_shape, network.n_particles + network.n_anchors)
+        total = total.index_add(-1, network.bonds[:, 0], ends).index_add(-1, network.bonds[:, 1], ends)
+        return (2 * total[..., : network.n_particles] / network.masses).amax().item()
+
+
+def _steps(interval: float, step: float) -> tuple[int, float]:
+    count = math.ceil(interval / step * (1 - 1e-12))
+    return count, interval / max(count, 1)
+
+
+def _linear(network: Network, state: State, step: float) -> Advance:
+    """Forces -K u - D v in plain torch; the dashpots act by the explicit midpoint rule around each step's end."""
+    u, v = state.displacement, state.velocity
+    inverse = 1 / network.align(network.masses, u)
+    force = network.force(u) * inverse
+    damped, now = network.is_damped, 0.0
+
+    def drag(v: Tensor, h: float) -> Tensor:
+        return v + h * inverse * network.damping_force(v + h / 2 * inverse * network.damping_force(v))
+
+    def advance(times: Tensor) -> NetworkTrajectory:
+        nonlocal u, v, force, now
+        outputs = []
+        for t in times.tolist():
+            count, h = _steps(t - now, step)
+            for _ in range(count):
+                v = drag(v, h / 2) if damped else v
+                v = v + h / 2 * force
+                u = u + h * v
+                force = network.force(u) * inverse
+                v = v + h / 2 * force
+                v = drag(v, h / 2) if damped else v
+            now = t
+            outputs.append(torch.stack([u, v]))
+        displacement, velocity = torch.stack(outputs, dim=-3)
+        return NetworkTrajectory(times, displacement, velocity)
+
+    return advance
+
+
+def _grains(network: Packing, state: State, step: float) -> Advance:
+    """Forces of the contact law at the grains' places, on the CPU; lists of near pairs are made anew as grains move."""
+    from torchchain.network import kernels  # imports Numba
+
+    if state.displacement.device.type != "cpu":
+        raise checks.fail(
+            "state", "be on the CPU for grains (linear=True: the network's linear motion)", "another device"
+        )
+    shape, dtype = state.displacement.shape, state.displacement.dtype
+    d = network.dimension
+    damping = torch.as_tensor(network.damping)
+    if damping.numel() and bool((damping != damping.flatten()[0]).any()):
+        raise checks.fail("damping", "be one number for grains, whose contacts change", "several")
+    gamma = damping.flatten()[0].item() if damping.numel() else 0.0
+    radii = network.radii.detach().double().numpy()
+    skin = SKIN * float(radii.max())
+    home = network.positions.detach().double().numpy()
+    rows = [
+        (home + u, v.copy())
+        for u, v in zip(
+            state.displacement.detach().double().reshape(-1, *shape[-2:]).numpy(),
+            state.velocity.detach().double().reshape(-1, *shape[-2:]).numpy(),
+            strict=True,
+        )
+    ]
+    masses = network.masses.detach().double().reshape(-1, network.n_particles).numpy()
+    starts = max(len(rows) // len(masses), 1)
+    hertz = network.contact == "hertz"
+    now = 0.0
+
+    def lists(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pairs, images = near_pairs(torch.from_numpy(x), network.radii, network.box, skin)
+        shifts = np.zeros((len(pairs), d))
+        if network.box is not None:
+            box = network.box.double()
+            shifts = (torch.where(images == 0, 0.0, images * box) if box.ndim == 1 else images.double() @ box).numpy()
+        return pairs.numpy(), np.ascontiguousarray(shifts)
+
+    listed = [(x.copy(), *lists(x)) for x, _ in rows]
+
+    def push(row: int, x: np.ndarray, v: np.ndarray, force: np.ndarray) -> None:
+        _, pairs, shifts = listed[row]
+        kernels.grain_force(x, radii, pairs, shifts, hertz, network.modulus, gamma, v, force)
+
+    forces = []
+    for row, (x, v) in enumerate(rows):
+        forces.append(np.empty_like(x))
+        push(row, x, v, forces[row])
+
+    def advance(times: Tensor) -> NetworkTrajectory:
+        nonlocal now
+        out = torch.empty((2, len(rows), len(times), *shape[-2:]), dtype=dtype)
+        for k, t in enumerate(times.tolist()):
+            count, h = _steps(t - now, step)
+            for row, (x, v) in enumerate(rows):
+                left = count
+                while left:
+                    origin, pairs, shifts = listed[row]
+                    left -= kernels.grain_steps(
+                        x, v, masses[row // starts], radii, pairs, shifts, hertz, network.modulus, gamma, h, left, origin,
+                        skin / 2 * 0.9, forces[row],
+                    )  # fmt: skip
+                    if left:
+                        listed[row] = (x.copy(), *lists(x))
+                out[0, row, k], out[1, row, k] = torch.from_numpy(x - home), torch.from_numpy(v)
+            now = t
+        displacement, velocity = out.reshape(2, *shape[:-2], len(times), *shape[-2:])
+        return NetworkTrajectory(times, displacement, velocity, openings=_openings(network, displacement))
+
+    return advance
+
+
+def _openings(network: Packing, displacement: Tensor) -> Tensor:
+    """Contacts of the network found open at an output, at it or before, (*batch, *any, time)."""
+    length = (network.bond_vectors + network.elongation(displacement)).square().sum(-1).sqrt()
+    is_open = length >= network.radii[network.bonds].sum(-1)
+    return (is_open.cumsum(-2) > 0).sum(-1)
+
+
+def grain_energy(network: Packing, trajectory: NetworkTrajectory) -> Tensor:
+    """Energy of the grains under the contact law itself, kinetic and in overlaps, less that of the overlaps at rest.
+
+    Counts the contacts of the network, closed or open, and none that formed later.
+
+    Returns:
+        (*batch, time).
+    """
+
+    def stored(length: Tensor) -> Tensor:
+        overlap = network.radii[network.bonds].sum(-1) - length
+        force, _ = contact_law(overlap, network.contact, network.modulus)
+        return force * overlap.clamp(min=0) * (0.5 if network.contact == "linear" else 0.4)
+
+    displacement, velocity = trajectory.displacement, trajectory.velocity
+    length = (network.bond_vectors + network.elongation(displacement)).square().sum(-1).sqrt()
+    kinetic = (network.align(network.masses, velocity) * velocity.square()).sum((-2, -1)) / 2
+    return kinetic + (stored(length) - stored(network.lengths)).sum(-1)
+
+
+METHOD = Method(
+    name="verlet",
+    start=start,
+    summary="velocity Verlet; grains of a packing move under the contact law itself, contacts opening, closing and turning",
+    order="2; the phase error of a mode grows as w^3 step^2 t / 24",
+    conserves="a nearby energy exactly, so that the energy of linear networks only swings, by (W step)^2 / 4; momentum",
+    stability="W step < 2; grains: W is that of the state at rest, and Hertz contacts stiffen as the root of the overlap",
+    cost="one force per step",
+    cannot="keep phases: their error grows with time; gradients and accelerators, for grains",
+    contacts=("linear", "hertz"),
+    damped=True,
+    options={
+        "step": "largest step; outputs are reached by equal steps of at most that (default 0.1 / W)",
+        "linear": "True for the linear motion of a packing's network",
+    },
+)

@@ -1,0 +1,280 @@
+"""Energy transfer between wavenumbers by the conserving ladder, at finite times.
+
+In the effective medium every energy is a product of two resolvents, at z above and at z~ below the real axis. With the
+vertex of Velicky (1969), which keeps the Ward identity of the coherent potential,
+
+    < G_qk(z) G_qk(z~) > = G_k G~_k [ delta_qk + X(z, z~) G_q G~_q / N ],
+    1 / X = (z^2 g - z~^2 g~) / (z^2 z~^2 (mu - mu~)) - (g - g~) / (z^2 mu - z~^2 mu~),
+
+for any law of masses: averaging the t-matrices leaves no trace of the law but mu. Both energies of wavenumber q follow
+from G_qk with one factor (z + z~)^2 / (2 z^2 z~^2), so that one double integral over the line Im z = eta, exact for every
+eta > 0, gives the energy at time t. The sum over the receiving wavenumbers is closed:
+
+    sum_q w_q^2 G_q G~_q = (sum_q w_q^2 G_q - sum_q w_q^2 G~_q) / (e - e~),    e = z^2 mu,
+
+so a pair of frequencies costs one product for every source and receiving band, whatever the number of particles.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from scipy import special
+from torch import Tensor
+
+from torchchain.theory.law import Law
+from torchchain.theory.medium import coherent_mass, site_resolvent
+
+FIRST, RATIO = 4.0, 10.0  # end of the first stretch of times, and how many times longer each next is
+DECAY = 9.0  # eta times the period of the time grid: exp(-2 DECAY) = 1.5e-8 of a period's energy comes back
+_FIRST_CUT = 60.0  # frequencies kept for the first stretch: what starts as t^4 falls off as frequency^-5
+_SMOOTH = 9.0  # width of the frequency cut times the first time of a stretch: exp(-(_SMOOTH/2)^2) = 2e-9
+_LATE = 400.0  # stretches that start here or later are averaged over time, with the standard deviation
+_AVERAGE = 10.0
+_BLOCK = 2**22  # complex numbers of the spectrum kept at a time
+_TAIL, _LATE_TAIL = 3e-7, 1e-3  # share of the modes beyond the last frequency, and of a late stretch
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """The ring of wavenumbers, the sources and the receiving bands.
+
+    Attributes:
+        n_particles: N.
+        n_bands: B.
+        sources: w_k^2 of the sources, (source,).
+        source_bands: band of each source, from 0, (source,).
+        momentum: whether sources start as momenta (the dual of stiffness disorder) and not as displacements.
+        damping: contact damping.
+    """
+
+    n_particles: int
+    n_bands: int
+    sources: Tensor
+    source_bands: Tensor
+    momentum: bool = False
+    damping: float = 0.0
+
+    @property
+    def tone_squares(self) -> Tensor:
+        """w_q^2 of tones 1 to N/2, (tone,)."""
+        n = self.n_particles
+        return 4 * torch.sin(math.pi / n * torch.arange(1, n // 2 + 1, dtype=torch.float64)).square()
+
+    @property
+    def tone_weights(self) -> Tensor:
+        """Wavenumbers +-q in a tone: 2, and 1 for the last, (tone,)."""
+        weight = torch.full((self.n_particles // 2,), 2.0, dtype=torch.float64)
+        weight[-1] = 1.0
+        return weight
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One stretch of times and its grid of frequencies."""
+
+    start: float
+    stop: float
+    eta: float
+    step: float
+    cut: float
+    smooth: float
+    points: int
+
+
+def stretches(last: float, edges: tuple[float, float], decay: float = DECAY, momentum: bool = False) -> list[Stretch]:
+    """Stretches that cover times up to ``last`` for a spectrum with these :func:`spectrum_edges`."""
+    found: list[Stretch] = []
+    start, stop = 0.0, min(FIRST, last) or FIRST
+    while True:
+        if start == 0:
+            cut = max(_FIRST_CUT, 10 * edges[0]) * max(1.0, 1.0 / stop) * (1 + momentum)
+            smooth = cut / 5
+        else:
+            smooth = _SMOOTH / start
+            cut = edges[start >= _LATE] + 3.5 * smooth
+        period = stop + 1.5 * _SMOOTH / smooth
+        step = math.pi / period
+        found.append(Stretch(start, stop, decay / period, step, cut, smooth, math.ceil((cut + 4 * smooth) / step)))
+        if stop >= last:
+            return found
+        start, stop = stop, min(stop * RATIO, last)
+
+
+def spectrum_edges(law: Law) -> tuple[float, float]:
+    """Frequencies above which less than shares 3e-7 and 1e-3 of the modes lie."""
+    top = 1.1 * 2 / math.sqrt(float(law.values.min()))
+    w = torch.linspace(top / 500, top, 500, dtype=torch.float64)
+    z = torch.complex(w, torch.full_like(w, 1e-4))
+    mass, _ = coherent_mass(z, law)
+    density = (2 / math.pi / w) * (z.square() * mass * site_resolvent(z.square() * mass)).imag
+    # 1e-4 above the axis every level has a tail of 1e-4 / (pi distance^2), which is no mode there.
+    density = (density - 2e-4 / (math.pi * (w - 1).square().clamp(min=0.25))).clamp(min=0)
+    beyond = (density * (w[1] - w[0])).flip(0).cumsum(0).flip(0)
+    first, late = (float(w[int((beyond > tail).nonzero()[-1])]) for tail in (_TAIL, _LATE_TAIL))
+    return first, late
+
+
+def ladder_transfer(law: Law, waves: Waves, times: Tensor, edges: tuple[float, float], decay: float = DECAY) -> Tensor:
+    """Share of each source's energy in each band, [source, time, receiver]."""
+    result = torch.zeros(len(waves.sources), len(times), waves.n_bands, dtype=torch.float64)
+    for stretch in stretches(float(times[-1]), edges, decay, waves.momentum):
+        inside = (times <= stretch.stop) & ((times > stretch.start) | (stretch.start == 0))
+        if bool(inside.any()):
+            result[:, inside] = _one_stretch(law, waves, times[inside], stretch)
+    return result
+
+
+def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Tensor:
+    # Frequencies (i + 1/2) step + i eta; those with a negative real part are mirror images.
+    points = stretch.points
+    right = (torch.arange(points, dtype=torch.float64) + 0.5) * stretch.step
+    z = torch.complex(right, torch.full_like(right, stretch.eta))
+    loss = 1 - 1j * waves.damping * z  # contact damping: K -> (1 - i damping z) K
+    inner = z / loss.sqrt()
+    mass, _ = coherent_mass(inner, law, waves.n_particles)
+    argument = inner.square() * mass
+    g = site_resolvent(argument, waves.n_particles)
+    received = _received(waves, argument)
+    source = 1 / (waves.sources[:, None] - argument)
+    window = _window(z, stretch)
+    z, inner = _mirrored(z, -1), _mirrored(inner, -1)
+    mass, g, argument, window, loss = (_mirrored(x) for x in (mass, g, argument, window, loss))
+    received, source = _mirrored(received), _mirrored(source)
+    coherent = _coherent(law, waves, times, stretch, z, source / loss, loss, window)
+
+    # A pair has the mean frequency (n + 1/2) step and the difference 2 m step + 2 i eta; n < 0 mirrors n >= 0.
+    differences = 2 * stretch.step * torch.arange(points, dtype=torch.float64)
+    low_pass = torch.ones(points, dtype=torch.complex128)
+    if stretch.start >= _LATE:  # a Gaussian average of the energy itself: the whole complex difference
+        low_pass = torch.exp(
+            -(torch.complex(differences, torch.full_like(right, 2 * stretch.eta)) * _AVERAGE).square() / 2
+        )
+    used = max(1, int((low_pass.abs() > 1e-9).sum()))
+    low_pass[1:] *= 2
+    growth = torch.exp(2 * stretch.eta * times)
+    pairs = len(waves.sources) * waves.n_bands
+    block = min(used, max(1, _BLOCK // pairs))
+    spectrum = torch.empty(block, len(waves.sources), waves.n_bands, dtype=torch.complex128)
+    energy_in_time = torch.zeros(len(times), pairs, dtype=torch.float64)
+    window = window * math.sqrt(2.0)
+    squares = inner.square()
+    z_, squares_, mass_, argument_, g_, loss_, window_, source_, received_ = (
+        x.conj().resolve_conj() for x in (z, squares, mass, argument, g, loss, window, source, received)
+    )
+    for m in range(used):
+        above, below = slice(points + m, 2 * points), slice(points - m, 2 * (points - m))
+        z1, a, e1, g1, l1 = z[above], squares[above], argument[above], g[above], loss[above]
+        z2, b, e2, g2, l2 = z_[below], squares_[below], argument_[below], g_[below], loss_[below]
+        d_mass, d_argument = mass[above] - mass_[below], e1 - e2
+        vertex = a * b * d_mass / ((a * g1 - b * g2) - a * b * d_mass * (g1 - g2) / d_argument)
+        if waves.momentum:
+            energy = (z1 + z2).square() / (2 * z1 * z2)
+        else:
+            energy = (l1 / z1.square() + l2 / z2.square()) / 2 + 1 / (z1 * z2)
+        weight = window[above] * window_[below] * vertex * energy / (d_argument * l1 * l2)
+        left = source[:, above] * source_[:, below] * weight
+        spectrum[m % block] = left @ (received[:, above] - received_[:, below]).T
+        if m % block == block - 1 or m == used - 1:
+            some = slice(m - m % block, m + 1)
+            angle = differences[some, None] * times
+            flat = spectrum[: m % block + 1].reshape(-1, pairs) * low_pass[some, None]
+            energy_in_time += angle.cos().T @ flat.real + angle.sin().T @ flat.imag
+    energy_in_time *= growth[:, None]
+    area = 2 * stretch.step**2 / (2 * math.pi) ** 2
+    scale = _source_scale(law, waves) * area
+    spread = (
+        energy_in_time.reshape(len(times), len(waves.sources), waves.n_bands).transpose(0, 1) * scale[:, None, None]
+    )
+    rows = torch.arange(len(waves.sources))
+    spread[rows, :, waves.source_bands] += coherent
+    return spread
+
+
+def _source_scale(law: Law, waves: Waves) -> Tensor:
+    """The factor of a source before G_k G~_k: w_k^2 for displacements, 1 / < 1/m > for momenta."""
+    return torch.full_like(waves.sources, 1 / law.moment(-1)) if waves.momentum else waves.sources
+
+
+def _mirrored(values: Tensor, sign: int = 1) -> Tensor:
+    """Values at -z* before those at z: their conjugates (for z itself minus them)."""
+    return torch.cat([sign * values.flip(-1).conj(), values], dim=-1)
+
+
+def _window(z: Tensor, stretch: Stretch) -> Tensor:
+    """1 on the spectrum, smoothly 0 beyond: in time a kernel narrower than the stretch's distance from 0."""
+    at = z.numpy()
+    return torch.from_numpy(
+        (special.erf((at + stretch.cut) / stretch.smooth) - special.erf((at - stretch.cut) / stretch.smooth)) / 2
+    )
+
+
+def _received(waves: Waves, argument: Tensor) -> Tensor:
+    """(1/N) sum over a band of w_q^2 / (w_q^2 - e), [band, frequency]; tones one block at a time."""
+    n, bands = waves.n_particles, waves.n_bands
+    squares = waves.tone_squares.reshape(bands, -1)
+    weights = (waves.tone_weights / n).reshape(bands, -1)
+    found = torch.zeros(bands, len(argument), dtype=argument.dtype)
+    size = max(1, 2**21 // (bands * len(argument)))
+    for block in range(0, squares.shape[1], size):
+        part, weight = squares[:, block : block + size, None], weights[:, block : block + size, None]
+        found += (weight * part / (part - argument)).sum(1)
+    return found
+
+
+def _coherent(
+    law: Law, waves: Waves, times: Tensor, stretch: Stretch, z: Tensor, mean: Tensor, loss: Tensor, window: Tensor
+) -> Tensor:
+    """Energy that is still in the source's own wave, [source, time], from the mean amplitudes.
+
+    An oscillator with the mass 1 / < 1/m >, right at high frequency, carries what is not smooth at t = 0.
+    """
+    squared = waves.sources[:, None]
+    mass = 1 / law.moment(-1)
+    rest = (mean - 1 / (squared * loss - z.square() * mass)) * window
+    wave = torch.exp(-1j * z[:, None] * times) * (stretch.step / (2 * math.pi))
+    if stretch.start >= _LATE:  # positive frequencies alone: no products that swing twice as fast
+        wave[: len(z) // 2] = 0
+    else:
+        wave /= 2
+    # Complex amplitudes whose real part is the amplitude, the oscillator's first.
+    displacement, velocity, momentum = _oscillator(squared, mass, waves.damping, times, waves.momentum)
+    if waves.momentum:
+        displacement = displacement + 2 * (rest @ wave)
+        velocity = velocity + 2 * (-1j * z * rest) @ wave
+        momentum = momentum + 2 * (-1j / z * squared * rest) @ wave
+    else:
+        displacement = displacement + 2 * (-1j / z * squared * rest) @ wave
+        velocity = velocity + 2 * (-squared * rest) @ wave
+        momentum = momentum + 2 * (-loss / z.square() * squared.square() * rest) @ wave
+    if stretch.start >= _LATE:
+        potential, kinetic = displacement.abs().square() / 2, (velocity * momentum.conj()).real / 2
+    else:
+        potential, kinetic = displacement.real.square(), velocity.real * momentum.real
+    return (kinetic + squared * potential) * mass if waves.momentum else potential + kinetic / squared
+
+
+def _oscillator(
+    squared: Tensor, mass: float, damping: float, times: Tensor, momentum: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Displacement, velocity and momentum of m u'' + d w^2 u' + w^2 u = 0, from u = 1 at rest or from momentum 1 at u = 0.
+
+    The real parts are they; an oscillator that swings has its positive frequency alone.
+    """
+    half = damping * squared / (2 * mass)
+    root = torch.sqrt(torch.complex(half.square() - squared / mass, torch.zeros_like(half)))
+    fast, slow = -half + root, -half - root
+    apart = fast - slow
+    up, down = torch.exp(fast * times), torch.exp(slow * times)
+    swings = (root.imag > 0).expand(up.shape)
+    if momentum:
+        displacement, velocity = (up - down) / apart / mass, (fast * up - slow * down) / apart / mass
+        one = [-2 * down / apart / mass, -2 * slow * down / apart / mass]
+    else:
+        displacement, velocity = (fast * down - slow * up) / apart, fast * slow * (down - up) / apart
+        one = [2 * fast * down / apart, 2 * fast * slow * down / apart]
+    displacement = torch.where(swings, one[0], displacement)
+    velocity = torch.where(swings, one[1], velocity)
+    return displacement, velocity, mass * velocity

@@ -1,0 +1,177 @@
+"""The effective medium of a disordered chain: coherent potential approximation for any law of masses.
+
+A random chain's mean resolvent < (K - z^2 M)^-1 > is that of an ordered chain whose mass mu(z) depends on frequency. The
+coherent potential approximation (Soven 1967, Taylor 1967) chooses mu so that one particle of the random chain, put into
+this chain, scatters nothing on average:
+
+    < V / (1 - V g) > = 0,    V = z^2 (m - mu),    g = (1/N) sum_q 1 / (w_q^2 - z^2 mu),    w_q = 2 sin(q / 2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain import Disorder
+from torchchain.theory.law import Law, law_of
+
+_STEPS, _DAMPED_STEPS = 150, 60
+_NEAR = 0.5
+_ABOVE_THE_AXIS = 1e-7  # a real frequency is taken as its limit from above
+
+
+@dataclass(frozen=True, eq=False)
+class EffectiveMedium:
+    """Mean properties of waves of each frequency, every tensor (frequency,).
+
+    Attributes:
+        frequencies: w, in units where the ordered chain's band ends at 2.
+        mass: effective mass mu(w), complex; its imaginary part is the scattering out of a plane wave.
+        resolvent: g(w) = (1/N) sum_q 1 / (w_q^2 - w^2 mu), complex, with a positive imaginary part.
+        wavenumber: complex q of the coherent wave, 4 sin^2(q / 2) = w^2 mu, its real part in [0, pi].
+        density_of_states: modes per particle and unit of frequency.
+        mean_free_path: of the coherent intensity, 1 / (2 Im q), in particles.
+        localization_length: 1 / gamma of a mode's amplitude, twice Im q being four times gamma for weak disorder, where
+            forward and backward scattering are equal: 2 / Im q.
+        residual: largest error of the self-consistency, in masses.
+    """
+
+    frequencies: Tensor
+    mass: Tensor
+    resolvent: Tensor
+    wavenumber: Tensor
+    density_of_states: Tensor
+    mean_free_path: Tensor
+    localization_length: Tensor
+    residual: float
+
+    def spectral_function(self, wavenumbers: Any) -> Tensor:
+        """A_k(w): how the energy of a wave k at rest is spread over frequency, (wavenumber, frequency), integral 1 over w."""
+        k = checks.real_tensor("wavenumbers", wavenumbers).to(torch.float64)
+        w = self.frequencies
+        squared = (4 * torch.sin(k / 2).square())[:, None]
+        return (2 / (math.pi * w)) * squared * (1 / (squared - w.square() * self.mass)).imag
+
+
+def effective_medium(
+    disorder: Disorder, frequencies: Any, n_particles: int | None = None, broadening: float = _ABOVE_THE_AXIS
+) -> EffectiveMedium:
+    """The coherent potential of a chain with random masses, by quadrature over their whole law.
+
+    For a chain of equal masses with random stiffnesses call it with the law of the compliance 1 / stiffness: tensions in
+    contacts obey the equation of displacements of particles with the compliances for masses.
+
+    Args:
+        disorder: of the masses, any kind.
+        frequencies: w > 0, (frequency,).
+        n_particles: of a ring, whose q are 2 pi n / N; None for the infinite chain.
+        broadening: imaginary part of the frequency. A ring has separate levels below its level spacing, pi / N or so.
+
+    Raises:
+        FieldError: for frequencies that are not positive.
+
+    Example:
+        >>> from torchchain import Disorder
+        >>> medium = effective_medium(Disorder(strength=0.3), [0.5, 1.0, 1.5])
+        >>> [round(x, 1) for x in medium.mean_free_path.tolist()]
+        [84.6, 17.3, 4.8]
+    """
+    checks.instance("disorder", disorder, Disorder)
+    w = checks.real_tensor("frequencies", frequencies).to(torch.float64)
+    if w.ndim != 1:
+        raise checks.fail("frequencies", "be one-dimensional", f"shape {tuple(w.shape)}")
+    checks.first_bad("frequencies", "be positive", w, w <= 0)
+    if n_particles is not None:
+        n_particles = checks.integer("n_particles", n_particles, 2)
+    broadening = checks.number("broadening", broadening, above=0)
+    z = torch.complex(w, torch.full_like(w, broadening))
+    mass, residual = coherent_mass(z, law_of(disorder), n_particles)
+    return _described(w, z, mass, n_particles, residual)
+
+
+def _described(w: Tensor, z: Tensor, mass: Tensor, n_particles: int | None, residual: float) -> EffectiveMedium:
+    argument = z.square() * mass
+    g = site_resolvent(argument, n_particles)
+    q = wavenumber(argument)
+    density = (2 / (math.pi * w)) * (argument * g).imag
+    return EffectiveMedium(w, mass, g, q, density, 1 / (2 * q.imag), 2 / q.imag, residual)
+
+
+def born_rates(strength: float, wavenumbers: Any) -> Tensor:
+    """Rate at which a plane wave loses coherent energy for weak disorder, 2 xi^2 sin(k/2) tan(k/2), (wavenumber,).
+
+    Fermi's golden rule, Gamma = (pi/2) xi^2 w^2 g(w) with the ordered chain's density of states g = 1 / (pi cos(k/2))
+    (Tamura 1983 for mass disorder in crystals).
+    """
+    strength = checks.number("strength", strength, at_least=0)
+    k = checks.real_tensor("wavenumbers", wavenumbers).to(torch.float64)
+    return 2 * strength**2 * torch.sin(k / 2) * torch.tan(k / 2)
+
+
+def coherent_mass(
+    z: Tensor, law: Law, n_particles: int | None = None, start: Tensor | None = None, tolerance: float = 1e-11
+) -> tuple[Tensor, float]:
+    """mu(z) for complex frequencies with Re z > 0 and Im z > 0, (frequency,), and the largest residual.
+
+    Damped iteration of mu = s - 1 / H(s), s = mu + 1 / (z^2 g), H(s) = < 1 / (s - m) >, which is the condition of no
+    scattering and converges in the upper half-plane; then Newton's method.
+    """
+    values = law.values.to(z.real)
+    if len(values) == 1:
+        return torch.full_like(z, float(values[0])), 0.0
+    weights = law.weights.to(z)
+    mass = torch.full_like(z, law.mean) if start is None else start.clone()
+
+    def mismatch(squared: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+        g, slope = _resolvent_and_slope(squared * mass, n_particles)
+        apart = 1 / (squared * g)
+        inverse = 1 / ((mass + apart)[:, None] - values)
+        mean, mean_slope = inverse @ weights, -inverse.square() @ weights
+        shift = 1 - apart / g * slope * squared
+        return 1 / mean - apart, 1 - shift - shift * mean_slope / mean.square()
+
+    # Newton's steps for what is near; the rest takes the damped iteration's, which converges from anywhere above the axis.
+    active = torch.arange(len(z))
+    residual = torch.zeros_like(z.real)
+    for step in range(_STEPS):
+        squared, here = z[active].square(), mass[active]
+        off, slope = mismatch(squared, here)
+        residual[active] = off.abs()
+        open_ = ~(off.abs() < tolerance)
+        if not bool(open_.any()):
+            break
+        active, squared, here, off, slope = active[open_], squared[open_], here[open_], off[open_], slope[open_]
+        newton = off / slope
+        trial = here - newton
+        good = ((squared * trial).imag > 0) & (newton.abs() < _NEAR * here.abs())
+        if start is None and step < _DAMPED_STEPS:
+            good &= off.abs() < 1e-3
+        mass[active] = torch.where(good, trial, here - 0.5 * off)
+    return mass, float(residual.max())
+
+
+def site_resolvent(argument: Tensor, n_particles: int | None = None) -> Tensor:
+    """g(e) = (1/N) sum_q 1 / (4 sin^2(q/2) - e) for complex e; the infinite chain's 1 / sqrt(e (e - 4)) for None."""
+    return _resolvent_and_slope(argument, n_particles)[0]
+
+
+def _resolvent_and_slope(e: Tensor, n_particles: int | None) -> tuple[Tensor, Tensor]:
+    g = -1 / (e * torch.sqrt(1 - 4 / e))
+    slope = -(e - 2) / (e * (e - 4)) * g
+    if n_particles is None:
+        return g, slope
+    # The images of the ring: a wave that has gone around is smaller by p^N, p + 1/p = 2 - e, 1/p - p = 1/g.
+    once = (2 / (2 - e + 1 / g)).pow(n_particles)
+    images = (1 + once) / (1 - once)
+    return g * images, slope * images + g * (2 * n_particles * once * g) / (1 - once).square()
+
+
+def wavenumber(argument: Tensor) -> Tensor:
+    """Complex q with 4 sin^2(q/2) = e, Re q in [0, pi], Im q > 0."""
+    q = 2 * torch.asin(torch.sqrt(argument) / 2)
+    return torch.complex(q.real.abs(), q.imag.abs())
