@@ -172,6 +172,9 @@ def test_help_lists_what_there_is():
     assert set(choices.EXCITATIONS) == set(EXCITATIONS)
     assert set(choices.METHODS) == set(tc.METHODS)
     assert set(choices.SOLVERS) == set(tc.SOLVERS)
+    assert set(choices.OBSERVABLES) == set(tc.OBSERVABLES)
+    assert set(choices.MODELS) == set(tc.MODELS)
+    assert set(choices.FITS) == {fit.name for model in tc.MODELS.values() for fit in model.fits}
 
 
 def test_help_shows_the_defaults_of_a_scene():
