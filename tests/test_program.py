@@ -100,11 +100,21 @@ def test_two_runs_into_one_folder(no_drawing, capsys, monkeypatch):
 
 @pytest.mark.parametrize("delay", [0.05, 0.15, 0.3, 0.6, 1.5])
 def test_an_interrupt_at_any_time_is_one_line(delay):
-    # Python itself must have come as far as this package: it says so by a first line of its own.
-    code = (
-        "import sys; print('begun', flush=True); sys.argv = ['torchchain', *sys.argv[1:]];"
-        "from torchchain.cli import main; sys.exit(main())"
-    )
+    # Before this package has set its own handler Python's counts: the signal is held back until then.
+    code = """
+import signal, sys
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+install = signal.signal
+def first(*arguments):
+    signal.signal = install
+    before = install(*arguments)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+    return before
+signal.signal = first
+print("begun", flush=True)
+from torchchain.cli import main
+sys.exit(main())
+"""
     process = subprocess.Popen(
         [sys.executable, "-c", code, "simulate", "--realizations", "100000", "--method", "modes", "--out", "out"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -162,6 +172,9 @@ def test_help_lists_what_there_is():
     assert set(choices.EXCITATIONS) == set(EXCITATIONS)
     assert set(choices.METHODS) == set(tc.METHODS)
     assert set(choices.SOLVERS) == set(tc.SOLVERS)
+    assert set(choices.OBSERVABLES) == set(tc.OBSERVABLES)
+    assert set(choices.MODELS) == set(tc.MODELS)
+    assert set(choices.FITS) == {fit.name for model in tc.MODELS.values() for fit in model.fits}
 
 
 def test_help_shows_the_defaults_of_a_scene():

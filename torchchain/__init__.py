@@ -6,16 +6,18 @@ for type checkers and for this file.
 
 from __future__ import annotations
 
-import ast
-from importlib import import_module
-from pathlib import Path
-from typing import Any
-
 from torchchain._version import __version__ as __version__
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
 
-def _names() -> tuple[list[str], dict[str, tuple[str, str]]]:
+
+def _read_names() -> None:
     """The public names, and for each name that resolves its module and what it is called there."""
+    import ast
+    from pathlib import Path
+
     shown: list[str] = []
     homes: dict[str, tuple[str, str]] = {}
     for entry in ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body:
@@ -23,16 +25,19 @@ def _names() -> tuple[list[str], dict[str, tuple[str, str]]]:
             homes |= {name.asname or name.name: (entry.module, name.name) for name in entry.names}
         elif isinstance(entry, ast.Assign):
             shown = sorted(ast.literal_eval(entry.value))
-    return shown, homes
-
-
-__all__, _HOME = _names()
+    globals().update(__all__=shown, _HOME=homes)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    from importlib import import_module
+
+    if "_HOME" not in globals():
+        _read_names()
+    if name in ("__all__", "_HOME"):
+        return globals()[name]
+    if name not in globals()["_HOME"]:
         raise AttributeError(f"module 'torchchain' has no attribute '{name}'")
-    home, original = _HOME[name]
+    home, original = globals()["_HOME"][name]
     module = None if home == __name__ else import_module(home)
     value = getattr(module, original, None) or import_module(f"{home}.{original}")
     globals()[name] = value
@@ -40,4 +45,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__", "energy", "master"]
+    return [*__getattr__("__all__"), "__version__", "energy", "master"]
