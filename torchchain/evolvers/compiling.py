@@ -16,7 +16,7 @@ from numba.extending import intrinsic
 
 
 def _compiled(*fastmath: str) -> Callable[[Callable], Any]:
-    settings: Any = {"nogil": True, "error_model": "numpy", "fastmath": set(fastmath)}
+    settings: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": set(fastmath)}
 
     def compile_on_first_call(function: Callable) -> Any:
         try:
