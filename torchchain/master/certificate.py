@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.master.memory import MemoryModel
+from torchchain.master.model import TransferModel
 
 ROUNDING = 1e-12
 """Shares of the energy that count as zero: rounding of a sum of exponentials in float64."""
@@ -38,6 +39,10 @@ GRID = (12, 36)
 """Times in each of the proof's intervals where constraints are looked for, until the proof succeeds."""
 CUTS = (3e-7, 3e-6, 3e-5)
 """Combinations of functions smaller than this share of the largest, in units of the error, are not fitted; the first that works."""
+SLOWEST = 0.5
+"""Decay rates are at least this over the last time: what is slower the data do not tell from what never decays."""
+LATER = 0.1
+"""Weight of times beyond the data, where a model is to go to Pi, relative to the last."""
 EARLY_DECAY = (1.5,)
 EARLY_PAIRS = ((0.4, 0.8), (0.7, 1.5), (1.0, 2.5), (1.5, 3.5), (2.0, 4.5))
 """Decay and frequency of functions for the first collisions: two waves beat at up to the sum of two frequencies, 4."""
@@ -72,7 +77,7 @@ class Certificate:
         """Whether T is proved not to be negative, to rounding."""
         return self.lower >= -ROUNDING
 
-    def to_dict(self) -> dict[str, float | int]:
+    def to_dict(self) -> dict[str, Any]:
         """For the report of a calibration; infinity as a word."""
         return {name: "infinite" if math.isinf(value) else value for name, value in asdict(self).items()}
 
@@ -82,7 +87,7 @@ class Certificate:
         checks.instance("certificate", record, dict)
         names = [entry.name for entry in fields(cls)]
         checks.known_keys("certificate", record, names)
-        values = {}
+        values: dict[str, Any] = {}
         for name in names:
             value = record.get(name, "nothing")
             values[name] = math.inf if value == "infinite" else checks.number(f"certificate.{name}", value)
@@ -115,6 +120,31 @@ class Exponentials:
         )  # fmt: skip
         return cls(model.basis.double().cpu().numpy().ravel(), np.concatenate([amplitudes[:single] + 0j, pairs]), poles)
 
+    @classmethod
+    def of_embedding(cls, model: TransferModel) -> Exponentials:
+        """The transfer of a model with rates, from the eigenvalues of its linear differential equation.
+
+        Raises:
+            CertificateError: where these do not say what the model does: growing, or no basis of eigenvectors.
+        """
+        with torch.no_grad():
+            parts = model.embedding()
+        generator = parts.generator.double().cpu().numpy()
+        poles, right = np.linalg.eig(generator)
+        scale = max(float(np.abs(generator).max()), 1e-300)
+        if float(poles.real.max()) > 1e-10 * scale:
+            raise CertificateError(f"model must not grow, got exp({float(poles.real.max()):.3g} t)")
+        left = np.linalg.pinv(right)
+        error = float(np.abs(right * poles @ left - generator).max())
+        if not error <= 1e-9 * scale:
+            raise CertificateError(f"rates must have a basis of eigenvectors, got an error of {error:.2g}")
+        start, readout = parts.start.double().cpu().numpy(), parts.readout.double().cpu().numpy()
+        weight = np.einsum("sm,mr->msr", start @ right, left @ readout).reshape(len(poles), -1)
+        rests = np.abs(poles) <= 1e-10 * scale
+        return cls(
+            weight[rests].sum(0).real, weight[~rests], np.minimum(poles[~rests].real, 0) + 1j * poles[~rests].imag
+        )
+
     def taylor(self, start: float, length: float, entries: Any = slice(None)) -> np.ndarray:
         """Taylor coefficients about ``start`` in units of ``length``, (entry, degree + 1)."""
         orders = np.arange(DEGREE + 1)
@@ -137,38 +167,60 @@ _LEFT = np.array([[math.comb(k, i) / 2.0**k for k in range(DEGREE + 1)] for i in
 _RIGHT = _LEFT[::-1, ::-1]
 
 
-def certify(model: MemoryModel) -> Certificate:
+def certify(model: TransferModel) -> Certificate:
     """Bounds of T(t) for every t >= 0.
 
     A few hundred products of small matrices; no time is sampled. The bounds contain the rounding of the evaluation.
 
     Args:
-        model: with memory; any.
+        model: with memory; with rates, whose eigenvalues are taken as exact; or one with a ``certificate`` by construction.
 
     Returns:
-        A certificate, which ``holds`` or not: ``lower`` is then an energy that the model takes somewhere, or minus
-        infinity where the proof was given up.
+        A certificate, which ``holds`` or not. ``lower`` is a bound in either case, close where it holds.
 
     Example:
         >>> certificate = certify(nonnegative(model))
         >>> certificate.holds, certificate.drift < 1e-12
         (True, True)
     """
-    checks.instance("model", model, MemoryModel)
-    parts = Exponentials.of(model)
+    checks.instance("model", model, TransferModel)
+    given = getattr(model, "certificate", None)
+    if isinstance(given, Certificate):
+        return given
+    if not isinstance(model, MemoryModel):
+        return _certify_rates(model)
+    return _bounded(Exponentials.of(model), _drift(model.basis, model.amplitudes))
+
+
+def _drift(basis: Tensor, amplitudes: Tensor) -> float:
+    """Largest distance of a row sum of T from 1, at any time."""
+    if not bool(basis.any()):  # damped chains
+        return math.inf
+    return float((amplitudes.detach().double().sum(-1).abs().sum(0) + (basis.double().sum(-1) - 1).abs()).max())
+
+
+def _certify_rates(model: TransferModel) -> Certificate:
+    """As for models with memory; no proof where rates grow or lack eigenvectors."""
+    try:
+        parts = Exponentials.of_embedding(model)
+    except CertificateError:
+        return Certificate(-math.inf, math.inf, math.inf, math.inf, 0)
+    drift = math.inf if bool(model.damping.any()) else model.conservation_defect
+    return _bounded(parts, drift)
+
+
+def _bounded(parts: Exponentials, drift: float) -> Certificate:
+    """Bounds of a sum of exponentials over all intervals of the time axis."""
     edges, tail = _edges(parts)
     lower = float((parts.level - parts.size(tail)).min())
     upper = float((parts.level + parts.size(tail)).max())
     for start, end in pairwise(edges):
         low, high = _bounds(parts, start, end - start)
         lower, upper = min(lower, low), max(upper, high)
-        if lower == -math.inf:
-            break
-    totals = model.amplitudes.detach().double().sum(-1).abs().sum(0) + (model.basis.double().sum(-1) - 1).abs()
-    return Certificate(lower, upper, float(totals.max()) if bool(model.basis.any()) else math.inf, tail, len(edges) - 1)
+    return Certificate(lower, upper, drift, tail, len(edges) - 1)
 
 
-def verify(model: MemoryModel, certificate: Certificate) -> None:
+def verify(model: TransferModel, certificate: Certificate) -> None:
     """Prove a model's certificate again.
 
     Raises:
@@ -202,7 +254,9 @@ def _edges(parts: Exponentials) -> tuple[list[float], float]:
 
 def _bounds(parts: Exponentials, start: float, length: float) -> tuple[float, float]:
     """Lower and upper bound of all entries in an interval."""
-    growth = np.exp(parts.pole.real * start + np.abs(parts.pole) * length)
+    reach = np.abs(parts.pole) * length
+    series = sum(reach**k / math.factorial(k) for k in range(DEGREE + 1))
+    growth = np.exp(parts.pole.real * start) * series
     extra = REMAINDER + 8 * np.finfo(float).eps * (np.abs(parts.level) + np.abs(parts.weight).T @ growth)
     rows = parts.taylor(start, length) @ _BERNSTEIN
     high = float((rows.max(1) + extra).max())
@@ -213,16 +267,14 @@ def _bounds(parts: Exponentials, start: float, length: float) -> tuple[float, fl
         if not len(rows):
             return low, high
         ends = np.minimum(rows[:, 0], rows[:, -1]) - extra
-        if float(ends.min()) < -ROUNDING:  # a value of T itself, as exactly as rounding lets it be known: no proof can come
-            return float(ends.min()), high
-        if len(rows) > MOST_ROWS:
-            break
+        if float(ends.min()) < -ROUNDING or len(rows) > MOST_ROWS:  # values of T itself: no proof can come
+            return min(low, float((rows.min(1) - extra).min())), high
         rows, extra = np.concatenate([rows @ _LEFT, rows @ _RIGHT]), np.concatenate([extra, extra])
         found = rows.min(1) - extra
         open_ = found < -ROUNDING
         low = min(low, float(found[~open_].min(initial=math.inf)))
         rows, extra = rows[open_], extra[open_]
-    return (low, high) if not len(rows) else (-math.inf, high)
+    return min(low, float((rows.min(1) - extra).min(initial=math.inf))), high
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,22 +352,34 @@ def nonnegative(
     eye = torch.eye(len(basis), dtype=basis.dtype)
     if distance is None:
         distance = (mean - eye[:, None]).abs().sum(-1).mean(0) / 2
-    spread = distance.double().numpy() 
+    spread = distance.double().numpy()
     weight = np.where(times.numpy() > 0, 1 / np.maximum(spread, 1e-5 * spread.max()), 0.0)
+    # beyond the data nothing but Pi is known: without it slow functions would go anywhere there
+    beyond = float(times[-1]) * np.geomspace(1.25, 100, 16)
+    grid, weight = np.concatenate([times.numpy(), beyond]), np.concatenate([weight, np.full(16, LATER * weight[-1])])
+    rest = torch.cat([mean - basis[:, None], torch.zeros(len(basis), 16, len(basis), dtype=basis.dtype)], dim=1).numpy()
+    slowest = SLOWEST / float(times[-1])
     poles = (
-        np.concatenate([model.decay.numpy(), EARLY_DECAY]),
-        np.concatenate([model.pair_decay.numpy(), [g for g, _ in EARLY_PAIRS]]),
+        np.concatenate([np.maximum(model.decay.numpy(), slowest), EARLY_DECAY]),
+        np.concatenate([np.maximum(model.pair_decay.numpy(), slowest), [g for g, _ in EARLY_PAIRS]]),
         np.concatenate([model.pair_frequency.numpy(), [w for _, w in EARLY_PAIRS]]),
     )
+
     def built(amplitudes: np.ndarray) -> MemoryModel:
         return MemoryModel(
-            model.rates, basis, torch.from_numpy(amplitudes), *map(torch.from_numpy, poles), damping=model.damping
+            model.rates,
+            basis,
+            torch.from_numpy(amplitudes),
+            torch.from_numpy(poles[0]),
+            torch.from_numpy(poles[1]),
+            torch.from_numpy(poles[2]),
+            model.damping,
         )
 
     lowest = -math.inf
     for cut in CUTS:
-        space = Space.of(*poles, times.numpy(), weight, cut)
-        free = _least_squares(space, times.numpy(), weight, (mean - basis[:, None]).numpy(), (eye - basis).numpy())
+        space = Space.of(*poles, grid, weight, cut)
+        free = _least_squares(space, grid, weight, rest, (eye - basis).numpy())
         if float(np.abs(free).sum(0).max()) > LARGEST_AMPLITUDES:
             continue
         if conserves:
@@ -352,9 +416,7 @@ def _refined(edges: list[float], points: int) -> np.ndarray:
     return np.unique(np.concatenate([*inside, np.geomspace(1e-3, 1, 8 * points)]))[1:]
 
 
-def _lifted(
-    space: Space, amplitudes: np.ndarray, basis: np.ndarray, grid: np.ndarray, conserves: bool
-) -> np.ndarray:
+def _lifted(space: Space, amplitudes: np.ndarray, basis: np.ndarray, grid: np.ndarray, conserves: bool) -> np.ndarray:
     """Amplitudes nearest to the given ones with T >= 0 on a grid of times, by cutting planes.
 
     Every pair of different bands is a problem of its own: what it gains, the source's own band loses.

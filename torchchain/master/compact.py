@@ -41,7 +41,8 @@ FLOOR = 0.05
 LARGEST_EXPONENT = 60.0
 TONES = 8
 """Tones of a receiving band that are summed over; of more, as many spread evenly."""
-RIDGE = 1e-2
+RIDGE = 10.0
+"""Against coefficients that the data do not tell, which would run away between the strengths of a family."""
 FIT_TIMES = 48
 SERIES = 0.1
 """Up to this time D is summed in powers of t, beyond as it stands: differences of cosines lose digits at first."""
@@ -87,7 +88,8 @@ class Waves:
         receiver = _poles(2 * np.sin(np.pi / n * tones), strength)
         coupling = strength**2 / n * width / len(inside)
         found = (source.real, -WIDTH * source.imag, receiver.real, -WIDTH * receiver.imag)
-        return cls(*(torch.from_numpy(value.copy()) for value in found), torch.tensor(coupling, dtype=torch.float64))
+        frequency, decay, others, other_decay = (torch.from_numpy(value.copy()) for value in found)
+        return cls(frequency, decay, others, other_decay, torch.tensor(coupling, dtype=torch.float64))
 
     def tensors(self) -> dict[str, Tensor]:
         return {
@@ -298,7 +300,7 @@ def _shapes(waves: CompactModel | Waves, degrees: tuple[int, int, int] | None = 
     far = ((far - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
     place = _polynomials((band[:, None] + band) / 2, degrees[0])
     distance = _polynomials(far, degrees[1])
-    p, q = terms(degrees)
+    p, _ = terms(degrees)
     pairs = list(dict.fromkeys((i, j) for i, j, _ in p))
     first = torch.stack([place[..., i] * distance[..., j] for i, j in pairs], dim=-1)
     own = _polynomials(band, degrees[0])
@@ -453,19 +455,20 @@ def solve(regressions: Sequence[Regression], mixing: np.ndarray, start: np.ndarr
         return sum(value for value, _ in each), [predicted for _, predicted in each]
 
     now, predicted = misfits(found)
-    damping, converged, step = 1.0, False, 0
-    for step in range(1, STEPS + 1):
+    damping, converged, steps = 1.0, False, 0
+    while steps < STEPS:
+        steps += 1
         matrix, pull = np.zeros((sets, size, sets, size)), np.zeros((sets, size))
         for r, c, p, m in zip(regressions, mixing @ found, predicted, mixing, strict=True):
             part, force = r.normal(p, r.table(c))
             matrix += m[:, None, None, None] * m[None, None, :, None] * part[None, :, None, :]
             pull += np.outer(m, force)
-        matrix = matrix.reshape(sets * size, -1)
-        diagonal = matrix.diagonal().copy()
+        square = matrix.reshape(sets * size, -1)
+        diagonal = square.diagonal().copy()
         better = math.inf
         while damping < 1e12:
-            matrix.flat[:: len(matrix) + 1] = diagonal * (1 + damping) + 1e-12
-            moved = found + np.linalg.solve(matrix, pull.ravel()).reshape(sets, size)
+            square.flat[:: len(square) + 1] = diagonal * (1 + damping) + 1e-12
+            moved = found + np.linalg.solve(square, pull.ravel()).reshape(sets, size)
             better, ahead = misfits(moved)
             if better < now:
                 break
@@ -481,7 +484,32 @@ def solve(regressions: Sequence[Regression], mixing: np.ndarray, start: np.ndarr
             converged = True
             break
     count = sum(r.data.size for r in regressions)
-    return found, {"converged": converged, "steps": step, "misfit": math.sqrt(now / count)}
+    return found, {"converged": converged, "steps": steps, "misfit": math.sqrt(now / count)}
+
+
+def refitted(problem: Regression, model: CompactModel, means: Sequence[np.ndarray]) -> list[CompactModel]:
+    """The models of other data like the problem's, by one step of Gauss and Newton each, for error bars.
+
+    Args:
+        problem: that the model was fitted to.
+        model: its solution.
+        means: T at the problem's times, [source, time, receiver], of ensembles drawn again.
+    """
+    table = problem.table(model.coefficients.detach().double().cpu().numpy())
+    found = problem.predicted(table)
+    matrix, rest = problem.normal(found, table)
+    inverse = np.linalg.inv(matrix)
+    models = []
+    for mean in means:
+        pull = np.zeros(problem.held.shape)
+        for i, weight in enumerate(problem.weight):
+            change = ((mean[:, i] - problem.data[:, i]) * weight).ravel()
+            pull += np.outer(problem._slope(found[:, i], weight).T @ change, problem.clock[i])
+        step = inverse @ (pull[problem.held] + rest)
+        tensors = model.tensors()
+        tensors["coefficients"] = tensors["coefficients"] + torch.from_numpy(step).to(tensors["coefficients"])
+        models.append(CompactModel(**tensors))
+    return models
 
 
 def chosen_times(times: Tensor) -> Tensor:
@@ -559,3 +587,87 @@ def fit_compact(
         **waves.tensors(),
     )  # fmt: skip
     return model, report | {"degrees": list(degrees)}
+
+
+@dataclass(frozen=True, eq=False)
+class CompactFamily:
+    """Compact models for a range of strengths xi: the coefficients are polynomials of sqrt(xi), the waves those of xi itself.
+
+    Any coefficients make a model that is never negative and conserves energy, so every strength in between has one.
+
+    Attributes:
+        scene: of the ensembles, but for the strength of the disorder.
+        lowest, highest: strengths of the ensembles that the family was fitted to.
+        degrees: of the polynomials in place, distance and time.
+        coefficients: (set, term), of Chebyshev's polynomials in sqrt(xi) from the zeroth.
+        rates: Q of the linear procedure, for comparison, [source, receiver].
+    """
+
+    scene: Scene
+    lowest: float
+    highest: float
+    degrees: tuple[int, int, int]
+    coefficients: Tensor
+    rates: Tensor
+
+    @property
+    def n_parameters(self) -> int:
+        return self.coefficients.numel()
+
+    def at(self, strength: float) -> CompactModel:
+        """The model at a strength above 0: below the lowest with the lowest's coefficients, for D is proportional to xi^2.
+
+        Raises:
+            FieldError: above the highest.
+        """
+        strength = checks.number("strength", strength, above=0, at_most=self.highest * (1 + 1e-12))
+        sets = torch.from_numpy(_sets(max(strength, self.lowest), self.lowest, self.highest, len(self.coefficients)))
+        return CompactModel(
+            rates=self.rates, degrees=torch.tensor(self.degrees, dtype=torch.float64),
+            coefficients=sets.to(self.coefficients) @ self.coefficients,
+            **_of_strength(self.scene, strength).tensors(),
+        )  # fmt: skip
+
+
+def _sets(strength: float, lowest: float, highest: float, count: int) -> np.ndarray:
+    """Chebyshev's polynomials in sqrt(xi), (set,)."""
+    span = max(math.sqrt(highest) - math.sqrt(lowest), 1e-12)
+    x = 2 * (math.sqrt(strength) - math.sqrt(lowest)) / span - 1
+    return np.cos(np.arange(count) * math.acos(min(1.0, max(-1.0, x))))
+
+
+def _of_strength(scene: Scene, strength: float) -> Waves:
+    """Waves of a scene with another strength of its masses' disorder."""
+    other = scene.stiffness_disorder
+    return Waves.of(scene, math.hypot(strength, 0.0 if other is None else other.strength))
+
+
+def fit_compact_family(
+    scenes: Sequence[Scene], times: Sequence[Tensor], means: Sequence[Tensor], long_times: Sequence[Tensor | None],
+    distances: Sequence[Tensor | None], rates: Tensor, degrees: tuple[int, int, int] = (9, 6, 13), sets: int = 5,
+    progress: Callable[[int], Any] | None = None,
+) -> tuple[CompactFamily, dict[str, Any]]:  # fmt: skip
+    """One family from ensembles that differ in the strength of their masses' disorder, all fitted at once.
+
+    Args:
+        scenes, times, means, long_times, distances: of each ensemble, see :func:`regression`.
+        rates: kept for comparison.
+        sets: coefficients of the polynomial in the strength, fewer than there are ensembles, or as many.
+
+    Raises:
+        FieldError: for too few ensembles, or if two have the same strength.
+    """
+    degrees = checked_degrees(degrees)
+    strengths = [scene.disorder.strength for scene in scenes]
+    if len(set(strengths)) < len(strengths) or not strengths or min(strengths) <= 0:
+        raise checks.fail("scenes", "have different strengths of disorder above 0", strengths)
+    sets = checks.integer("sets", sets, 1, len(scenes))
+    lowest, highest = min(strengths), max(strengths)
+    problems = [
+        regression(_of_strength(scene, scene.disorder.strength), degrees, t, mean, late, distance)
+        for scene, t, mean, late, distance in zip(scenes, times, means, long_times, distances, strict=True)
+    ]
+    mixing = np.stack([_sets(strength, lowest, highest, sets) for strength in strengths])
+    found, report = solve(problems, mixing, progress=progress)
+    family = CompactFamily(scenes[0], lowest, highest, degrees, torch.from_numpy(found), rates)
+    return family, report | {"degrees": list(degrees), "strengths": strengths, "sets": sets}
