@@ -55,10 +55,9 @@ def test_bounds_enclose_every_value_and_come_close(depth, decay):
 def test_a_dip_between_sampled_times_is_found():
     """Energies that are negative for a ten-thousandth of the time axis, to a millionth."""
     rate = 50.0
-    # y(t) = 1/2 (1 - e^{-gt}(...)) with a dip of depth 1e-6 near t = 2 pi / w
-    model = oscillating(0.0, decay=1e-9, frequency=rate)
+    model = oscillating(0.0, decay=1e-6, frequency=rate)
     assert certify(model).lower >= -1e-12  # touches zero at every period, and is proved not to cross
-    worse = oscillating(1e-3, decay=1e-9, frequency=rate)  # crosses by 2.5e-7 |sin| just before each
+    worse = oscillating(1e-3, decay=1e-6, frequency=rate)  # crosses by 2.5e-7 |sin| just before each
     found = certify(worse)
     assert not found.holds
     assert float(dense(worse, 61.0).min()) < 0
@@ -121,23 +120,18 @@ def test_onset_is_the_fourth_power_of_time(small_transfer):
     lost = 1 - model.transfer(times).diagonal(dim1=0, dim2=2).T
     strong = lost[:, 0] > 1e-12  # above rounding
     assert bool(strong.any())
-    assert float((lost[strong, 1] / lost[strong, 0]).max()) < 17
-    assert float((lost[strong, 1] / lost[strong, 0]).min()) > 14
+    power = (lost[strong, 1] / lost[strong, 0]).log2()
+    assert bool(((power > 3.5) & (power < 4.5)).all())  # the fourth is the nearest power
 
 
 def test_bounds_of_random_sums_agree_with_fine_grids():
     generator = np.random.default_rng(2)
     basis = generator.dirichlet(np.ones(4), 4)
     for _ in range(5):
-        amplitudes = 0.05 * generator.normal(size=(5, 4, 4))
+        amplitudes = 0.05 * generator.normal(size=(4, 4, 4))
         amplitudes -= amplitudes.mean(-1, keepdims=True)
-        amplitudes[0] = np.eye(4) - basis - amplitudes[1]
-        amplitudes = amplitudes[[0, 1, 2, 3]]
-        amplitudes[2] = 0
-        amplitudes[0] = np.eye(4) - basis - amplitudes[1]
-        model = memory(
-            basis, np.stack([amplitudes[0], amplitudes[1], 0 * basis, amplitudes[3]]), (0.4, 1.2), (0.3,), (0.9,)
-        )
+        amplitudes[0] = np.eye(4) - basis - amplitudes[1] - amplitudes[2]
+        model = memory(basis, amplitudes, (0.4, 1.2), (0.3,), (0.9,))
         certificate, values = certify(model), dense(model, 100.0)
         lowest = float(values.min())
         assert certificate.lower <= lowest + 1e-13
