@@ -1,0 +1,466 @@
+"""Models with memory that are never negative: a proof for the whole time axis, and the fit that passes it.
+
+T(t) = Pi + sum_m A_m f_m(t) is a sum of exponentials, real and damped oscillations. On an interval of the time axis it is a
+Taylor polynomial and a remainder bounded by its poles; a polynomial lies above the smallest of its coefficients in
+Bernstein's basis (Bernstein 1912; Cargo and Shisha 1966), which close in on it as the interval is cut in two. Beyond some
+time Pi is larger than all that still decays. So finitely many intervals bound T from below at every t >= 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import optimize
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.master.memory import MemoryModel
+from torchchain.master.model import TransferModel
+
+ROUNDING = 1e-12
+"""Shares of the energy that count as zero: rounding of a sum of exponentials in float64."""
+DEGREE = 16
+REMAINDER = 1e-15
+MOST_INTERVALS = 20_000
+DEEPEST, MOST_ROWS = 40, 10**5
+"""Halvings of an interval, and pieces of it, before the proof is given up."""
+ONSET = 4
+"""Derivatives at t = 0, from the zeroth, that are exact: T(t) = I + O(t^4), as for a chain released from rest."""
+MARGIN = 1e-3
+"""A fitted energy stays above this share of its long-time value, so that the proof needs no fine intervals."""
+ROUNDS = 60
+GRID = (12, 36)
+"""Times in each of the proof's intervals where constraints are looked for, until the proof succeeds."""
+CUTS = (3e-7, 3e-6, 3e-5)
+"""Combinations of functions smaller than this share of the largest, in units of the error, are not fitted; the first that works."""
+SLOWEST = 0.5
+"""Decay rates are at least this over the last time: what is slower the data do not tell from what never decays."""
+LATER = 0.1
+"""Weight of times beyond the data, where a model is to go to Pi, relative to the last."""
+EARLY_DECAY = (1.5,)
+EARLY_PAIRS = ((0.4, 0.8), (0.7, 1.5), (1.0, 2.5), (1.5, 3.5), (2.0, 4.5))
+"""Decay and frequency of functions for the first collisions: two waves beat at up to the sum of two frequencies, 4."""
+LARGEST_AMPLITUDES = 1000.0
+"""Of a fit, sum_m |A_m| of a pair of bands: above it rounding grows, and what is fitted is noise."""
+
+
+class CertificateError(ValueError):
+    """A model that was to be certified is not what its certificate says."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is proved of T(t) = Pi + sum_m A_m f_m(t), for every t >= 0.
+
+    Attributes:
+        lower: no entry of T is below it.
+        upper: none is above it.
+        drift: no row sum of T differs from 1 by more, infinity if T decays to zero (damped chains).
+        tail: from this time on Pi outweighs all that still decays.
+        intervals: of the time axis before it, that were needed.
+    """
+
+    lower: float
+    upper: float
+    drift: float
+    tail: float
+    intervals: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether T is proved not to be negative, to rounding."""
+        return self.lower >= -ROUNDING
+
+    def to_dict(self) -> dict[str, Any]:
+        """For the report of a calibration; infinity as a word."""
+        return {name: "infinite" if math.isinf(value) else value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, Any]) -> Certificate:
+        """The inverse of :meth:`to_dict`, checked."""
+        checks.instance("certificate", record, dict)
+        names = [entry.name for entry in fields(cls)]
+        checks.known_keys("certificate", record, names)
+        values: dict[str, Any] = {}
+        for name in names:
+            value = record.get(name, "nothing")
+            values[name] = math.inf if value == "infinite" else checks.number(f"certificate.{name}", value)
+        return cls(**values | {"intervals": checks.integer("certificate.intervals", record["intervals"], 0)})
+
+
+@dataclass(frozen=True, eq=False)
+class Exponentials:
+    """y_e(t) = level_e + Re sum_m weight[m, e] exp(pole_m t), for many entries e at once.
+
+    Attributes:
+        level: (entry,).
+        weight: complex, (pole, entry).
+        pole: complex, (pole,), real parts not positive.
+    """
+
+    level: np.ndarray
+    weight: np.ndarray
+    pole: np.ndarray
+
+    @classmethod
+    def of(cls, model: MemoryModel) -> Exponentials:
+        """The transfer of a model, entries [source, receiver] in a row; without its damping, which only lowers it."""
+        single = len(model.decay)
+        amplitudes = model.amplitudes.detach().double().cpu().numpy().reshape(len(model.amplitudes), -1)
+        pairs = amplitudes[single::2] - 1j * amplitudes[single + 1 :: 2]
+        poles = np.concatenate(
+            [-model.decay.double().cpu().numpy() + 0j,
+             -model.pair_decay.double().cpu().numpy() + 1j * model.pair_frequency.double().cpu().numpy()]
+        )  # fmt: skip
+        return cls(model.basis.double().cpu().numpy().ravel(), np.concatenate([amplitudes[:single] + 0j, pairs]), poles)
+
+    @classmethod
+    def of_embedding(cls, model: TransferModel) -> Exponentials:
+        """The transfer of a model with rates, from the eigenvalues of its linear differential equation.
+
+        Raises:
+            CertificateError: where these do not say what the model does: growing, or no basis of eigenvectors.
+        """
+        with torch.no_grad():
+            parts = model.embedding()
+        generator = parts.generator.double().cpu().numpy()
+        poles, right = np.linalg.eig(generator)
+        scale = max(float(np.abs(generator).max()), 1e-300)
+        if float(poles.real.max()) > 1e-10 * scale:
+            raise CertificateError(f"model must not grow, got exp({float(poles.real.max()):.3g} t)")
+        left = np.linalg.pinv(right)
+        error = float(np.abs(right * poles @ left - generator).max())
+        if not error <= 1e-9 * scale:
+            raise CertificateError(f"rates must have a basis of eigenvectors, got an error of {error:.2g}")
+        start, readout = parts.start.double().cpu().numpy(), parts.readout.double().cpu().numpy()
+        weight = np.einsum("sm,mr->msr", start @ right, left @ readout).reshape(len(poles), -1)
+        rests = np.abs(poles) <= 1e-10 * scale
+        return cls(
+            weight[rests].sum(0).real, weight[~rests], np.minimum(poles[~rests].real, 0) + 1j * poles[~rests].imag
+        )
+
+    def taylor(self, start: float, length: float, entries: Any = slice(None)) -> np.ndarray:
+        """Taylor coefficients about ``start`` in units of ``length``, (entry, degree + 1)."""
+        orders = np.arange(DEGREE + 1)
+        powers = (self.pole[:, None] * length) ** orders / [math.factorial(k) for k in orders]
+        weight = self.weight[:, entries] * np.exp(self.pole * start)[:, None]
+        found = (weight.T @ powers).real
+        found[:, 0] += self.level[entries]
+        return found
+
+    def size(self, start: float) -> np.ndarray:
+        """sum_m |weight| exp(Re pole t): what still moves at a time, (entry,)."""
+        return np.abs(self.weight).T @ np.where(self.pole.real == 0, 1.0, np.exp(self.pole.real * min(start, 1e300)))
+
+
+_BERNSTEIN = np.array(
+    [[math.comb(k, i) / math.comb(DEGREE, i) for k in range(DEGREE + 1)] for i in range(DEGREE + 1)]
+)  # coefficients in powers to coefficients in Bernstein's basis: all weights in [0, 1], no cancellation
+_LEFT = np.array([[math.comb(k, i) / 2.0**k for k in range(DEGREE + 1)] for i in range(DEGREE + 1)])
+"""De Casteljau's halving: Bernstein coefficients of the left half; the right half's are the mirror image."""
+_RIGHT = _LEFT[::-1, ::-1]
+
+
+def certify(model: TransferModel) -> Certificate:
+    """Bounds of T(t) for every t >= 0.
+
+    A few hundred products of small matrices; no time is sampled. The bounds contain the rounding of the evaluation.
+
+    Args:
+        model: with memory; with rates, whose eigenvalues are taken as exact; or one with a ``certificate`` by construction.
+
+    Returns:
+        A certificate, which ``holds`` or not. ``lower`` is a bound in either case, close where it holds.
+
+    Example:
+        >>> certificate = certify(nonnegative(model))
+        >>> certificate.holds, certificate.drift < 1e-12
+        (True, True)
+    """
+    checks.instance("model", model, TransferModel)
+    given = getattr(model, "certificate", None)
+    if isinstance(given, Certificate):
+        return given
+    if not isinstance(model, MemoryModel):
+        return _certify_rates(model)
+    return _bounded(Exponentials.of(model), _drift(model.basis, model.amplitudes))
+
+
+def _drift(basis: Tensor, amplitudes: Tensor) -> float:
+    """Largest distance of a row sum of T from 1, at any time."""
+    if not bool(basis.any()):  # damped chains
+        return math.inf
+    return float((amplitudes.detach().double().sum(-1).abs().sum(0) + (basis.double().sum(-1) - 1).abs()).max())
+
+
+def _certify_rates(model: TransferModel) -> Certificate:
+    """As for models with memory; no proof where rates grow or lack eigenvectors."""
+    try:
+        parts = Exponentials.of_embedding(model)
+    except CertificateError:
+        return Certificate(-math.inf, math.inf, math.inf, math.inf, 0)
+    drift = math.inf if bool(model.damping.any()) else model.conservation_defect
+    return _bounded(parts, drift)
+
+
+def _bounded(parts: Exponentials, drift: float) -> Certificate:
+    """Bounds of a sum of exponentials over all intervals of the time axis."""
+    edges, tail = _edges(parts)
+    lower = float((parts.level - parts.size(tail)).min())
+    upper = float((parts.level + parts.size(tail)).max())
+    for start, end in pairwise(edges):
+        low, high = _bounds(parts, start, end - start)
+        lower, upper = min(lower, low), max(upper, high)
+    return Certificate(lower, upper, drift, tail, len(edges) - 1)
+
+
+def verify(model: TransferModel, certificate: Certificate) -> None:
+    """Prove a model's certificate again.
+
+    Raises:
+        CertificateError: if the model's energies go lower, or drift more, than the certificate says.
+    """
+    checks.instance("certificate", certificate, Certificate)
+    found = certify(model)
+    for name in ("lower", "drift"):
+        said, now = getattr(certificate, name), getattr(found, name)
+        worse = said - now if name == "lower" else now - said
+        if not (now == said or worse <= ROUNDING):
+            raise CertificateError(f"certificate must hold for its model: {name} {said:.3g}, got {now:.3g}")
+
+
+def _edges(parts: Exponentials) -> tuple[list[float], float]:
+    """Ends of intervals on which the Taylor remainder is below REMAINDER, up to the time where Pi outweighs the rest."""
+    edges, size = [0.0], np.abs(parts.weight)
+    speed = np.abs(parts.pole)[:, None] ** (DEGREE + 1)
+    factorial = float(math.factorial(DEGREE + 1))
+    slack = np.maximum(parts.level, 0) + ROUNDING / 4
+    if bool((size[parts.pole.real == 0].sum(0) > slack).any()):  # what never decays is never outweighed
+        return edges, math.inf
+    while len(edges) <= MOST_INTERVALS:
+        now = size * np.exp(parts.pole.real * edges[-1])[:, None]
+        if bool((now.sum(0) <= slack).all()):
+            break
+        fastest = max(float((now * speed).sum(0).max()), 1e-300)
+        edges.append(edges[-1] + (REMAINDER * factorial / fastest) ** (1 / (DEGREE + 1)))
+    return edges, edges[-1]
+
+
+def _bounds(parts: Exponentials, start: float, length: float) -> tuple[float, float]:
+    """Lower and upper bound of all entries in an interval."""
+    reach = np.abs(parts.pole) * length
+    series = sum(reach**k / math.factorial(k) for k in range(DEGREE + 1))
+    growth = np.exp(parts.pole.real * start) * series
+    extra = REMAINDER + 8 * np.finfo(float).eps * (np.abs(parts.level) + np.abs(parts.weight).T @ growth)
+    rows = parts.taylor(start, length) @ _BERNSTEIN
+    high = float((rows.max(1) + extra).max())
+    open_ = rows.min(1) - extra < -ROUNDING
+    low = float((rows.min(1) - extra)[~open_].min(initial=math.inf))
+    rows, extra = rows[open_], extra[open_]
+    for _ in range(DEEPEST):
+        if not len(rows):
+            return low, high
+        ends = np.minimum(rows[:, 0], rows[:, -1]) - extra
+        if float(ends.min()) < -ROUNDING or len(rows) > MOST_ROWS:  # values of T itself: no proof can come
+            return min(low, float((rows.min(1) - extra).min())), high
+        rows, extra = np.concatenate([rows @ _LEFT, rows @ _RIGHT]), np.concatenate([extra, extra])
+        found = rows.min(1) - extra
+        open_ = found < -ROUNDING
+        low = min(low, float(found[~open_].min(initial=math.inf)))
+        rows, extra = rows[open_], extra[open_]
+    return min(low, float((rows.min(1) - extra).min(initial=math.inf))), high
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """The functions of time that a fit combines: those of fixed poles that vanish at t = 0 with ONSET - 1 derivatives.
+
+    Attributes:
+        decay, pair_decay, pair_frequency: the poles, (exponential,), (pair,), (pair,).
+        start: coefficients of one function that is 1 at t = 0 and has no slope there, (function,).
+        free: coefficients of functions orthonormal over the times of the fit, (function, direction).
+    """
+
+    decay: np.ndarray
+    pair_decay: np.ndarray
+    pair_frequency: np.ndarray
+    start: np.ndarray
+    free: np.ndarray
+
+    @classmethod
+    def of(
+        cls, decay: np.ndarray, pair_decay: np.ndarray, pair_frequency: np.ndarray, times: np.ndarray,
+        weight: np.ndarray, cut: float,
+    ) -> Space:  # fmt: skip
+        """Directions whose weighted functions are below ``cut`` of the largest are left out."""
+        bare = cls(decay, pair_decay, pair_frequency, np.zeros(0), np.zeros(0))
+        onset = np.concatenate([bare.functions(np.zeros(1), k) for k in range(ONSET)])
+        onset /= np.linalg.norm(onset, axis=1, keepdims=True)
+        first = np.zeros(ONSET)
+        first[0] = 1 / np.linalg.norm(bare.functions(np.zeros(1)))
+        start = np.linalg.pinv(onset) @ first
+        vanishing = np.linalg.svd(onset)[2][ONSET:].T
+        functions = bare.functions(times) * weight[:, None]
+        _, scale, right = np.linalg.svd(functions @ vanishing, full_matrices=False)
+        held = scale > cut * scale[0]
+        return cls(decay, pair_decay, pair_frequency, start, vanishing @ (right[held].T / scale[held]))
+
+    def functions(self, times: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """f_m or one of its derivatives, (time, function)."""
+        poles = np.concatenate([-self.decay + 0j, -self.pair_decay + 1j * self.pair_frequency])
+        values = np.exp(times[:, None] * poles) * poles**derivative
+        single = len(self.decay)
+        pairs = values[:, single:]
+        return np.concatenate(
+            [values[:, :single].real, np.stack([pairs.real, pairs.imag], axis=-1).reshape(len(times), -1)], axis=1
+        )
+
+
+def nonnegative(
+    model: MemoryModel, times: Tensor, mean: Tensor | None = None, distance: Tensor | None = None
+) -> MemoryModel:
+    """The nearest model with the same poles whose energies are never negative, and which starts as exactly as a chain.
+
+    Weighted least squares for the amplitudes under T(t) >= 0 at every t, T(t) = I + O(t^4) and row sums of 1: convex, by
+    cutting planes. Each round adds the deepest negative energies to the constraints; the dual problem is one of
+    nonnegative least squares (Lawson and Hanson 1974). Functions for the first collisions, EARLY_PAIRS, are added to the
+    model's poles. Deterministic; the result passes :func:`certify`.
+
+    Args:
+        model: its poles, basis Pi and damping are kept.
+        times: of the fit, (time,).
+        mean: T that is fitted, [source, time, receiver]; None for the model's own.
+        distance: expected total variation of two ensembles at each time, (time,), whose inverse is the weight of a time; None
+            to count each time relative to how far energy has moved by then.
+
+    Raises:
+        CertificateError: if no such model was found, with the lowest energy of the best.
+    """
+    checks.instance("model", model, MemoryModel)
+    times = checks.times("times", times).to(model.basis)
+    with torch.no_grad():
+        mean = model.transfer(times) if mean is None else checks.real_tensor("mean", mean).to(model.basis)
+    basis = model.basis.clamp(min=0)
+    conserves = bool(basis.any())
+    basis = basis / basis.sum(-1, keepdim=True) if conserves else basis
+    eye = torch.eye(len(basis), dtype=basis.dtype)
+    if distance is None:
+        distance = (mean - eye[:, None]).abs().sum(-1).mean(0) / 2
+    spread = distance.double().numpy()
+    weight = np.where(times.numpy() > 0, 1 / np.maximum(spread, 1e-5 * spread.max()), 0.0)
+    # beyond the data nothing but Pi is known: without it slow functions would go anywhere there
+    beyond = float(times[-1]) * np.geomspace(1.25, 100, 16)
+    grid, weight = np.concatenate([times.numpy(), beyond]), np.concatenate([weight, np.full(16, LATER * weight[-1])])
+    rest = torch.cat([mean - basis[:, None], torch.zeros(len(basis), 16, len(basis), dtype=basis.dtype)], dim=1).numpy()
+    slowest = SLOWEST / float(times[-1])
+    poles = (
+        np.concatenate([np.maximum(model.decay.numpy(), slowest), EARLY_DECAY]),
+        np.concatenate([np.maximum(model.pair_decay.numpy(), slowest), [g for g, _ in EARLY_PAIRS]]),
+        np.concatenate([model.pair_frequency.numpy(), [w for _, w in EARLY_PAIRS]]),
+    )
+
+    def built(amplitudes: np.ndarray) -> MemoryModel:
+        return MemoryModel(
+            model.rates,
+            basis,
+            torch.from_numpy(amplitudes),
+            torch.from_numpy(poles[0]),
+            torch.from_numpy(poles[1]),
+            torch.from_numpy(poles[2]),
+            model.damping,
+        )
+
+    lowest = -math.inf
+    for cut in CUTS:
+        space = Space.of(*poles, grid, weight, cut)
+        free = _least_squares(space, grid, weight, rest, (eye - basis).numpy())
+        if float(np.abs(free).sum(0).max()) > LARGEST_AMPLITUDES:
+            continue
+        if conserves:
+            _balance(free)
+        edges, _ = _edges(Exponentials.of(built(free)))
+        for points in GRID:
+            found = built(_lifted(space, free, basis.numpy(), _refined(edges, points), conserves))
+            certificate = certify(found)
+            if certificate.holds:
+                return found
+            lowest = max(lowest, certificate.lower)
+    raise CertificateError(f"model must have no negative energy, got {lowest:.3g} at best")
+
+
+def _least_squares(
+    space: Space, times: np.ndarray, weight: np.ndarray, data: np.ndarray, at_zero: np.ndarray
+) -> np.ndarray:
+    """Amplitudes [function, source, receiver] nearest to the data [source, time, receiver]."""
+    functions = space.functions(times)
+    rest = data.transpose(1, 0, 2).reshape(len(times), -1) - np.outer(functions @ space.start, at_zero.ravel())
+    best = np.linalg.lstsq(functions @ space.free * weight[:, None], rest * weight[:, None], rcond=None)[0]
+    return (np.outer(space.start, at_zero.ravel()) + space.free @ best).reshape(-1, *at_zero.shape)
+
+
+def _balance(amplitudes: np.ndarray) -> None:
+    """Row sums of zero to the last digit, at the expense of each source's own band."""
+    for _ in range(2):
+        np.einsum("mss->ms", amplitudes)[...] -= amplitudes.sum(-1)
+
+
+def _refined(edges: list[float], points: int) -> np.ndarray:
+    """Times above 0, so many in each of the proof's intervals."""
+    inside = [np.linspace(a, b, points, endpoint=False) for a, b in pairwise(edges)]
+    return np.unique(np.concatenate([*inside, np.geomspace(1e-3, 1, 8 * points)]))[1:]
+
+
+def _lifted(space: Space, amplitudes: np.ndarray, basis: np.ndarray, grid: np.ndarray, conserves: bool) -> np.ndarray:
+    """Amplitudes nearest to the given ones with T >= 0 on a grid of times, by cutting planes.
+
+    Every pair of different bands is a problem of its own: what it gains, the source's own band loses.
+    """
+    directions = np.concatenate([space.functions(grid), space.functions(np.zeros(1), ONSET)])
+    level = np.concatenate([np.ones(len(grid)), [0.0]])
+    result = amplitudes.copy()
+    for source in range(len(basis)):
+        energies = directions @ amplitudes[:, source] + np.outer(level, basis[source])
+        # first energies are c t^4, with c of the fit, late ones Pi: half the harmonic mean of the two
+        onset = np.minimum(np.abs(energies[-1]) / math.factorial(ONSET), basis[source])
+        ratio = np.outer(grid**4, onset) / np.maximum(basis[source], 1e-300)
+        margin = MARGIN * np.vstack([basis[source] * ratio / (1 + ratio), onset * math.factorial(ONSET)])
+        for band in np.flatnonzero((energies < 0.5 * margin).any(0)):
+            if band != source:
+                push = _push(directions @ space.free, margin[:, band] - energies[:, band], margin[:, band])
+                result[:, source, band] += space.free @ push
+    if conserves:
+        _balance(result)
+    return result
+
+
+def _push(directions: np.ndarray, short: np.ndarray, margin: np.ndarray) -> np.ndarray:
+    """The smallest x with directions @ x >= short, (direction,), to half the margin."""
+    cuts = np.zeros(0, dtype=int)
+    push = np.zeros(directions.shape[1])
+    for _ in range(ROUNDS):
+        missing = short - directions @ push
+        deepest = missing > 0.5 * margin
+        deepest[1:-2] &= (missing[1:-2] >= missing[:-3]) & (missing[1:-2] >= missing[2:-1])
+        new = np.flatnonzero(deepest)
+        if not len(new):
+            break
+        cuts = np.union1d(cuts, new)
+        # Lawson and Hanson's least distance programming
+        rows = directions[cuts]
+        size = np.linalg.norm(rows, axis=1)
+        needed = short[cuts] / size
+        scale = np.abs(needed).max()
+        system = np.vstack([(rows / size[:, None]).T, needed / scale])
+        target = np.zeros(len(system))
+        target[-1] = 1.0
+        multipliers, _ = optimize.nnls(system, target, maxiter=100 * len(cuts))
+        rest = target - system @ multipliers
+        push = scale * (system[:-1] @ multipliers) / rest[-1]
+        cuts = cuts[multipliers > 0]
+    return push

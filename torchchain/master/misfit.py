@@ -1,0 +1,44 @@
+"""The error of a model itself: by how much it misses its own ensemble beyond what the ensemble's error explains."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torchchain import checks
+
+TIMES, BANDS = 2, 2
+"""Neighbors on either side over which the model's error is averaged."""
+
+
+def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, spread: Tensor) -> Tensor:
+    """Standard error of a model beyond its statistical one, [source, time, receiver].
+
+    What is missed is counted in units of the ensemble's error, which grows as t^4 at first, and averaged over neighbors: the
+    source's own band, which holds most of the energy, with the own bands of neighboring sources, the others among
+    themselves. An average over all bands would hide what the own band is missed by.
+
+    Args:
+        predicted, mean: the model's and the ensemble's transfer, [source, time, receiver].
+        stderr: standard error of the ensemble's.
+        spread: standard error of the model's by bootstrap, which explains a part of what is missed.
+    """
+    for name, value in (("mean", mean), ("stderr", stderr), ("spread", spread)):
+        if value.shape != predicted.shape:
+            raise checks.fail(name, f"have shape {tuple(predicted.shape)}", f"shape {tuple(value.shape)}")
+    variance = stderr.square()
+    noise = (variance - spread.square()).clamp(min=0)
+    unit = torch.where(variance > 0, variance, torch.ones_like(variance))
+    excess = ((predicted - mean).square() - noise) / unit
+    own = torch.eye(len(mean), dtype=torch.bool, device=mean.device)[:, None].expand_as(mean)
+    table = excess.diagonal(dim1=0, dim2=2)[None]  # [1, time, source]
+    kept = functional.avg_pool2d(
+        table[:, None], (2 * TIMES + 1, 2 * BANDS + 1), 1, (TIMES, BANDS), count_include_pad=False
+    )[0, 0].T
+    others = (~own).to(excess)
+    size, edge = (2 * TIMES + 1, 2 * BANDS + 1), (TIMES, BANDS)
+    total = functional.avg_pool2d((excess * others)[:, None], size, 1, edge)[:, 0]
+    count = functional.avg_pool2d(others[:, None], size, 1, edge)[:, 0]
+    smooth = torch.where(own, kept[:, :, None], total / count.clamp(min=1e-12))
+    return (smooth.clamp(min=0) * unit).sqrt() * (variance > 0)
