@@ -62,7 +62,8 @@ def select(
             warnings.simplefilter("ignore", FitWarning)
             model, _ = candidate.run(seen, progress=progress)
         distance = float(total_variation(model.transfer(transfer.times).detach(), held)[:, used].mean())
-        tried.append(Rung(candidate.model_name, candidate.order, distance))
+        assert candidate.model is not None, "a rung names its model"
+        tried.append(Rung(candidate.model.name, candidate.order, distance))
         models.append(model)
         if distance <= ENOUGH * noise:
             break
