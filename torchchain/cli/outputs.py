@@ -93,9 +93,8 @@ def write(out: str | Path, writers: dict[str, Writer]) -> None:
     with _reported(Path(out)):
         out = Path(out).absolute()
         out.parent.mkdir(parents=True, exist_ok=True)
-        aside = (
-            out if out.exists() else out.parent
-        )  # a folder of the user's own may lie where nothing else can be written
+        # A folder of the user's own may lie where nothing else can be written.
+        aside = out if out.exists() else out.parent
         _clear_staging(aside, out.name)
         prefix = f".{out.name[:100]}.{os.getpid()}-"
         staging = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=aside))
@@ -104,7 +103,8 @@ def write(out: str | Path, writers: dict[str, Writer]) -> None:
                 writer(staging / name)
             staging.chmod(0o755)
             if out.exists():
-                (out / RECORD).unlink(missing_ok=True)
+                if RECORD in writers:  # no old record beside new data
+                    (out / RECORD).unlink(missing_ok=True)
                 for name in writers:
                     os.replace(staging / name, out / name)
                 staging.rmdir()
