@@ -276,7 +276,7 @@ def calls(transfer, masters):
     yield "implied_timescales", tc.implied_timescales, (transfer, torch.tensor([0.5, 1.0]))
     yield "RateModel", tc.RateModel, (0 * rows, rows, 0 * rows[0])
     yield "SwingInModel", tc.SwingInModel, (0 * rows, rows, rows[0] + 1, 0 * rows[0])
-    yield "MemoryModel", lambda *given: tc.MemoryModel(*given), tuple(single.values())
+    yield "MemoryModel", lambda *given: tc.MemoryModel(**dict(zip(single, given, strict=True))), tuple(single.values())
     for kind, master in masters.items():
         for method in ("expm", "dopri5", "rk4"):
             yield (

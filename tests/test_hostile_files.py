@@ -104,13 +104,14 @@ def flags_of(kind, prefix=""):
 
 
 WORDS = ("nan", "-inf", "-1", "1e300", "1e-300", "word", "", "99999999999999999999")
+POSITIONAL = {("compare", "a"), ("compare", "b"), ("sweep", "command"), ("sweep", "fields"), ("import", "runs"), ("convert", "run"), ("convert", "out")}  # fmt: skip
 SHARED = set(flags_of(flags.SceneFlags))
 EVERY_FLAG = [
     (command, flag)
     for command, kind in flags.COMMANDS.items()
     for flag in flags_of(kind)
     if not (command != "simulate" and flag in SHARED)
-    and (command, flag) not in {("predict", "model"), ("rerun", "folder"), ("family", "models")}
+    and (command, flag) not in {("predict", "model"), ("rerun", "folder"), ("family", "models"), *POSITIONAL}
 ]
 FREE = {"out", "config", "artifact"}  # any word may be the name of a file
 ALSO = {
@@ -120,6 +121,7 @@ ALSO = {
     ("predict", "times.stop"): ("times.step",),
     ("calibrate", "fit"): ("method must be",),
     ("family", "out"): ("file nothing must be a readable file",),
+    ("compare", "out"): ("file nothing must be a readable data file",),
     ("simulate", "config"): ("No such file",),
     ("plan", "artifact"): ("No such file",),
     ("predict", "config"): ("No such file",),
@@ -142,6 +144,7 @@ def test_hostile_words_for_every_flag(command, flag, run, masters, family, tmp_p
         (family if flag == "strength" else masters["markov"]).save(model)
     begin = {
         "simulate": SMALL, "calibrate": SMALL, "plan": SMALL[:-2], "predict": [str(model)], "rerun": ["nothing"], "family": ["nothing"],
+        "compare": ["nothing", "nothing"], "sweep": ["simulate", "n_particles=8,16", "n_bands=2"], "import": ["nothing"], "convert": ["nothing", "out.nc"],
     }[command]  # fmt: skip
     kind = ["--excitation.kind", "impulse"] if flag in ("excitation.site", "excitation.velocity") else []
     before = sorted(os.listdir(tmp_path))
@@ -384,6 +387,12 @@ def test_reading_a_model_runs_nothing_of_it(kind, masters, family, tmp_path, mon
         record["versions"]["os"] = CODE
         record["method"] = CODE
     write(path, header, outer, data)
+    with nothing_runs(monkeypatch), pytest.raises(FieldError, match="report"):  # a record of no such fields
+        reader.load(path)
+    for record in header.get("members", [header]):
+        del record["report"]["note"], record["report"][CODE]
+        record["report"].pop("fit", None)
+    write(path, header, outer, data)
     with nothing_runs(monkeypatch):
         read = reader.load(path)
     first = read.members[0] if kind == "family" else read
@@ -442,7 +451,7 @@ def family_file(family, tmp_path):
     return path
 
 
-OLD = [0, 1, -1, 3, 2.5, 1e300, True, None, "2", [2], {}]
+OLD = [0, 1, -1, 2, 2.5, 1e300, True, None, "2", [2], {}]
 
 
 @pytest.mark.parametrize("version", OLD)
@@ -450,10 +459,10 @@ def test_files_of_other_versions_are_refused_by_version(version, model_file, fam
     for path, reader in ((model_file, tc.MasterEquation), (family_file, tc.MasterFamily)):
         header, outer, data = parts(path)
         write(path, {**header, "format_version": version}, outer, data)
-        refused(path, reader, "must have format version 2, got")
+        refused(path, reader, "must have format version 3")
     header["members"][1]["format_version"] = version
     write(path, header, outer, data)
-    refused(path, reader, "must have format version 2, got")
+    refused(path, reader, "must have format version 3")
 
 
 BAD_ERRORS = {
@@ -611,18 +620,19 @@ def test_one_kind_of_file_is_not_the_other(model_file, family_file):
 def test_a_family_of_broken_files(name, model_file, run, tmp_path):
     good = model_file.read_bytes()
     (tmp_path / "broken").write_bytes(SPOILS[name](good))
+    (tmp_path / "empty").mkdir()
     for models, message in (
         (("broken",), "file broken must be a master equation saved by torchchain"),
         ((model_file, "broken"), "file broken must be a master equation saved by torchchain"),
         ((model_file, model_file), "members must have different strengths"),
         (("nothing",), "file nothing must be a readable file"),
-        ((".",), "file . must be a file"),
+        (("empty",), "file empty must be a file"),
         ((), "models"),
     ):
         status, output, errors = run("family", *models, "--out", "out")
         assert (status, output, errors.count("\n")) == (2, "", 1)
         assert message in errors
-    assert sorted(os.listdir(tmp_path)) == ["broken", "model.safetensors"]
+    assert sorted(os.listdir(tmp_path)) == ["broken", "empty", "model.safetensors"]
 
 
 # netCDF

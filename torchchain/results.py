@@ -116,6 +116,7 @@ def open_folder(folder: str | Path) -> RunFolder:
     >>> run = tc.open("results/calibrate")  # doctest: +SKIP
     >>> run.scene.disorder, run.master.n_bands, run.transfer.mean.shape  # doctest: +SKIP
     """
+    checks.instance("folder", folder, str, Path)
     path = Path(folder)
     if not path.is_dir():
         raise checks.fail("folder", "be the folder of a run", "a file" if path.exists() else f"nothing at {folder}")

@@ -10,7 +10,7 @@ import math
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,11 +55,12 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
     if loaded:
         config["plugins"] = loaded
     fields = swept(flags.fields)
+    checks.device("device", flags.device)
     points = list(combinations(fields, config))
     for point in points:  # all of them before the first is run
         tables = ("plugins", *(["calibration"] if flags.command == "calibrate" else []))
         Scene.from_dict({name: value for name, value in point.config.items() if name not in tables})
-    with outputs.run_folder(flags.out) as out:
+    with outputs.run_folder(flags.out) as out, _cleared_if_empty(out / "runs", out):
         for number, point in enumerate(points, 1):
             folder, text = out / "runs" / point.name, tomli_w.dumps(point.config)
             if _done(folder, text):
@@ -80,6 +81,8 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
                     run_simulate(Simulate(**how), again)
                 else:
                     run_calibrate(Calibrate(**how), again)
+            if rank_of_environment() == 0:  # what was asked for, once it is there
+                outputs.write(folder.parent, {f"{point.name}.toml": outputs.text(text)})
         if rank_of_environment():
             return
         folders = [RunFolder(out / "runs" / point.name) for point in points]
@@ -97,6 +100,18 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
     print(
         f"{len(points)} runs of {flags.command} over {', '.join(fields)}; {time.time() - began:.1f} s, results in {flags.out}"
     )
+
+
+@contextmanager
+def _cleared_if_empty(*folders: Path) -> Iterator[None]:
+    """What fails before its first result leaves no empty folder."""
+    try:
+        yield
+    except BaseException:
+        for folder in folders:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def swept(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:

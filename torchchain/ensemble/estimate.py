@@ -49,6 +49,6 @@ def estimate_disorder(
     law = scene.disorder if scene is not None else None
     return fit_disorder(
         transfer.times, transfer.block_mean, n_particles, transfer.n_bands, None if scene is None else scene.tones,
-        kind or (law.kind if law is not None else "normal"),
+        kind if kind is not None else (law.kind if law is not None else "normal"),
         lower if lower is not None else (law.lower if law is not None else 0.05), damping, guess,
     )  # fmt: skip

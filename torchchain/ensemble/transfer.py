@@ -390,7 +390,7 @@ def band_transfer(
     """
     checks.truth("long_time", long_time)
     scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
-    if method == THEORY:
+    if isinstance(method, str) and method == THEORY:
         checks.known_keys("options of method 'theory'", options or {}, ())
         with stages("theory"):
             return _from_theory(scene, long_time and scene.damping == 0)

@@ -51,13 +51,13 @@ def recipe(
     elif record is not None and fit is None:
         fit = record.fit()
     if record is None or fit is None:
-        chosen, n_times, given = NoSettings(), 2, window or LINEAR_WINDOW
+        chosen, n_times, given = NoSettings(), 2, LINEAR_WINDOW
     else:
         if fit not in record.fits:
             able = ", ".join(other.name for other in fitted_by(fit.name))
             raise checks.fail("model", f"be one of {able} for method '{fit.name}'", repr(record.name))
         checks.known_keys(f"settings of method '{fit.name}'", settings, fit.settings_names)
-        chosen, n_times, given = fit.settings(**settings), fit.least_times, window or fit.window
+        chosen, n_times, given = fit.settings(**settings), fit.least_times, fit.window
         fit.check(chosen, len(data.times))
     given = checked_window(given if window is None else window)
     if not data.is_ordered:

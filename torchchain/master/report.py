@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 import typing
@@ -143,7 +144,7 @@ def read(name: str, kind: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, Mapping):
             raise checks.FieldTypeError(f"{name} must be a table, got {checks.shown(value)}")
-        hints = typing.get_type_hints(kind)
+        hints = _hints(kind)  # type: ignore[arg-type]
         fields = {entry.name: entry for entry in dataclasses.fields(kind)}
         checks.known_keys(name, value, fields)
         for key, entry in fields.items():
@@ -160,3 +161,9 @@ def read(name: str, kind: Any, value: Any) -> Any:
     if not isinstance(value, kind):
         raise checks.FieldTypeError(f"{name} must be of type {kind.__name__}, got {checks.shown(value)}")
     return value
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    """The declared types of a record; Python evaluates them, so this is done once and never of what a file says."""
+    return typing.get_type_hints(kind)

@@ -24,7 +24,6 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import State
 from torchchain.evolvers.chebyshev import check_work
-from torchchain.evolvers.coefficients import coefficients_of
 from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS
 from torchchain.evolvers.method import Advance, Method
 from torchchain.modes import phase
@@ -118,6 +117,8 @@ def _plain(network: Network, state: State, frequency: Tensor, tolerance: float) 
     weight = 1 / network.align(network.masses, pair)
     weight = weight * network.align((4 / frequency.square()).to(network.masses)[..., None], pair)
     now = 0.0
+
+    from torchchain.evolvers.coefficients import coefficients_of  # imports Numba
 
     def step(pair: Tensor, interval: np.ndarray) -> Tensor:
         table = torch.from_numpy(coefficients_of(frequencies, interval, tolerance)).to(pair)
@@ -435,6 +436,8 @@ class CompiledAdvance:
         self, run: Callable[..., None], state: np.ndarray, w: float, intervals: np.ndarray, pool: Any, threads: int
     ) -> np.ndarray:
         """States (output, 2, particle, component) at some intervals after a state."""
+        from torchchain.evolvers.coefficients import coefficients_of  # imports Numba
+
         cosine, integral, derivative = coefficients_of(np.full(len(intervals), w), intervals, self.tolerance)
         kinds = [kind for kind in (0, 1) if state[kind].any()] or [0]
         count = max(2, len(cosine))

@@ -123,6 +123,8 @@ def lattice(
     extent = tuple(checks.integer("shape", a, 1) for a in shape)
     if len(extent) != d:
         raise checks.fail("shape", f"have {d} entries for kind '{kind}'", extent)
+    if not isinstance(boundary, str) and not checks.is_collection(boundary):
+        raise checks.FieldTypeError(f"boundary must be a string or one for each axis, got {checks.shown(boundary)}")
     walls = (boundary,) * d if isinstance(boundary, str) else tuple(boundary)
     for wall in walls:
         checks.choice("boundary", wall, BOUNDARIES)

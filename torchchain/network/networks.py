@@ -114,9 +114,8 @@ class Network:
         if self.box is None:
             return None
         d = self.dimension
-        if isinstance(self.box, Tensor) or np.ndim(self.box):
-            box = torch.as_tensor(self.box).to(self.positions)
-        else:
+        box = _as_tensor("box", self.box, "None or real numbers").to(self.positions)
+        if box.ndim == 0:
             raise checks.FieldTypeError(f"box must be None or have shape ({d},) or ({d}, {d}), got {self.box!r}")
         if tuple(box.shape) not in ((d,), (d, d)):
             raise checks.fail("box", f"have shape ({d},) or ({d}, {d})", f"shape {tuple(box.shape)}")
@@ -130,7 +129,7 @@ class Network:
         return box
 
     def _checked_bonds(self) -> Tensor:
-        bonds = torch.as_tensor(np.asarray(self.bonds) if not isinstance(self.bonds, Tensor) else self.bonds)
+        bonds = _as_tensor("bonds", self.bonds, "pairs of integers")
         if bonds.numel() == 0:
             return torch.zeros((0, 2), dtype=torch.int64, device=self.masses.device)
         if bonds.is_floating_point() or bonds.is_complex() or bonds.dtype == torch.bool:
@@ -492,3 +491,14 @@ def _product(blocks: Tensor, x: Tensor) -> Tensor:
 
 def _pair(bonds: Tensor, b: int) -> str:
     return f"{int(bonds[b, 0])} and {int(bonds[b, 1])}"
+
+
+def _as_tensor(field: str, value: Any, words: str) -> Tensor:
+    """A tensor of integers or real numbers, infinite ones among them, from whatever holds them."""
+    try:
+        values = value if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        values = torch.zeros(0, dtype=torch.bool)
+    if values.is_complex() or values.dtype == torch.bool or values.layout != torch.strided or values.is_meta:
+        raise checks.FieldTypeError(f"{field} must be {words}, got {checks.shown(value)}")
+    return values

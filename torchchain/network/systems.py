@@ -15,11 +15,11 @@ from torchchain.network.modes import normal_modes as network_modes
 from torchchain.network.networks import Network
 
 
-def evolve(system: Chain | Network, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:
+def evolve(chain: Chain | Network, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:
     """States of a chain or a network at the given times.
 
     Args:
-        system: masses (*batch, particle).
+        chain: a chain or a network, masses (*batch, particle).
         state: the start at time 0, (*batch, *any, particle), and with an axis (component) behind it for a network.
         times: (time,), in units of the travel time of sound over one particle; increasing, not negative.
         method: a name in ``METHODS`` (of chains) or ``torchchain.network.METHODS``; each entry states its order, stability,
@@ -40,24 +40,24 @@ def evolve(system: Chain | Network, state: State, times: Any, method: str = "mod
     >>> tc.evolve(chain, tc.impulse(chain, site=8), [0.0, 1.0, 2.0]).velocity.shape
     torch.Size([2, 3, 16])
     """
-    if isinstance(system, Network):
-        return networks.evolve(system, state, times, method, **options)
-    return evolved(system, state, times, method, options, stacklevel=4)
+    if isinstance(chain, Network):
+        return networks.evolve(chain, state, times, method, **options)
+    return evolved(chain, state, times, method, options, stacklevel=4)
 
 
 @overload
-def normal_modes(system: Chain) -> NormalModes: ...
+def normal_modes(chain: Chain) -> NormalModes: ...
 
 
 @overload
-def normal_modes(system: Network) -> NetworkModes: ...
+def normal_modes(chain: Network) -> NetworkModes: ...
 
 
-def normal_modes(system: Chain | Network) -> NormalModes | NetworkModes:
+def normal_modes(chain: Chain | Network) -> NormalModes | NetworkModes:
     """Normal modes of a chain (linear, or linearized) or of a network, checked for residual and orthogonality.
 
     Args:
-        system: undamped; Hertz contacts are taken at the initial overlap.
+        chain: a chain or a network, undamped; Hertz contacts are taken at the initial overlap.
 
     Returns:
         NormalModes with frequencies (*batch, mode), ascending, and shapes with shapes^T M shapes = 1; NetworkModes for a
@@ -71,4 +71,4 @@ def normal_modes(system: Chain | Network) -> NormalModes | NetworkModes:
     >>> tc.normal_modes(tc.Chain(torch.ones(4, dtype=torch.float64))).frequencies.round(decimals=4)
     tensor([0.0000, 1.4142, 1.4142, 2.0000], dtype=torch.float64)
     """
-    return network_modes(system) if isinstance(system, Network) else spectrum.normal_modes(system)
+    return network_modes(chain) if isinstance(chain, Network) else spectrum.normal_modes(chain)
