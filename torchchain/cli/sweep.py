@@ -66,17 +66,11 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
             if _done(folder, text):
                 continue
             log.info("run %d of %d: %s", number, len(points), point.name)
-            request = folder.parent / f"{point.name}.toml"
-            if rank_of_environment() == 0:
-                outputs.write(folder.parent, {request.name: outputs.text(text)})
-            how: dict[str, Any] = {
-                "config": str(request),
-                "out": str(folder),
-                "device": flags.device,
-                "threads": flags.threads,
-            }
-            with redirect_stdout(io.StringIO()):
-                again = [flags.command, "--config", str(request), "--out", str(folder)]
+            with TemporaryDirectory(prefix="torchchain-sweep-") as scratch, redirect_stdout(io.StringIO()):
+                request = Path(scratch) / "config.toml"
+                request.write_text(text, encoding="utf-8")
+                how: dict[str, Any] = {"config": str(request), "out": str(folder), "device": flags.device}
+                again = [flags.command, "--config", str(folder / "config.toml"), "--out", str(folder)]
                 if flags.command == "simulate":
                     run_simulate(Simulate(**how), again)
                 else:
