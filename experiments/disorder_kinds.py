@@ -81,7 +81,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             )  # fmt: skip
             rings = {name: values[:, 0] for name, values in each_realization_of_ring(ring, device).items()}
             found = each_realization(kick, config.method, device) | {
-                "share": rings["band_energy"][..., band - 1], "long_time": rings["long_time"]
+                "share": rings["band_energy"][..., band - 1], "long_time": rings["long_time_band_energy"]
             }  # fmt: skip
             for name, values in found.items():
                 mean, error = mean_and_error(values)

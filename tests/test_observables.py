@@ -58,9 +58,10 @@ def test_own_observables_are_measured_on_the_part_that_moves(method, tmp_path):
     data = tc.simulate(wanted, method, checkpoint=Checkpoint(tmp_path, 0))
     chain = wanted.chain(range(5))
     exact = tc.evolve(chain, wanted.state(chain), wanted.times)
+    allowed = tc.plan(wanted).tolerance if method == "auto" else 3e-5  # what the plan promises, or the cut's own error
     for entry in OWN:
         expected = entry.compute(wanted, chain, exact).mean(0).numpy()
-        np.testing.assert_allclose(data[entry.name].values, expected, rtol=0, atol=3e-5 * abs(expected).max())
+        np.testing.assert_allclose(data[entry.name].values, expected, rtol=0, atol=allowed * abs(expected).max())
     assert data["speeds"].dims == ("time", "particle")
     assert data["peak"].attrs == {"units": "initial overlap", "long_name": "largest displacement"}
     again = Checkpoint(tmp_path, 0)

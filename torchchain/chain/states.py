@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -50,6 +51,7 @@ class Trajectory:
     velocity: Tensor
     dissipated: Tensor | None = None
     openings: Tensor | None = None
+    axes_of_a_state: ClassVar[tuple[str, ...]] = ("particle",)
 
     def __post_init__(self) -> None:
         checks.instance("trajectory.times", self.times, Tensor)
@@ -62,11 +64,11 @@ class Trajectory:
                 raise checks.FieldTypeError(
                     f"trajectory.{field} must be a dense tensor of float32 or float64, got {value.dtype} on {value.device}"
                 )
-        shape = self.displacement.shape
-        if len(shape) < 2 or shape[-2] != len(self.times):
-            rule = f"have shape (*batch, time, particle) with {len(self.times)} times"
+        shape, inner = self.displacement.shape, len(self.axes_of_a_state)
+        if len(shape) < 1 + inner or shape[-1 - inner] != len(self.times):
+            rule = f"have shape (*batch, time, {', '.join(self.axes_of_a_state)}) with {len(self.times)} times"
             raise checks.fail("trajectory.displacement", rule, f"shape {tuple(shape)}")
-        for field, expected in (("velocity", shape), ("dissipated", shape[:-1]), ("openings", shape[:-1])):
+        for field, expected in (("velocity", shape), ("dissipated", shape[:-inner]), ("openings", shape[:-inner])):
             value = getattr(self, field)
             if value is not None and value.shape != expected:
                 rule = f"have shape {tuple(expected)} beside the displacement"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -15,6 +16,8 @@ from torchchain.network.networks import Network
 @dataclass(frozen=True, eq=False)
 class NetworkTrajectory(Trajectory):
     """States of networks in time: displacement and velocity (*batch, *any, time, particle, component)."""
+
+    axes_of_a_state: ClassVar[tuple[str, ...]] = ("particle", "component")
 
     @property
     def final(self) -> State:
