@@ -80,7 +80,7 @@ def gathered(
     firsts: list[tuple[Tensor, Tensor]] = []
     trajectory_of = iter(trajectories)
     run = 0
-    for run, chain in enumerate(chains, 1):  # noqa: B007  how many there were is told below
+    for run, chain in enumerate(chains, 1):
         checks.instance(f"chains, run {run}", chain, Chain)
         path = next(trajectory_of, None)
         if path is None:
