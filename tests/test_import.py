@@ -380,3 +380,41 @@ def test_a_failed_write_leaves_what_was_there(run, tmp_path, monkeypatch):
 
 def test_help_lists_the_formats():
     assert tuple(name for name, known in FORMATS.items() if known.holds == "particles") == choices.FORMATS
+
+
+# Networks
+
+
+def test_grains_of_a_dump_are_a_packing(tmp_path):
+    """Four disks in a periodic square: contacts across the box, masses and frames in the order of the ids."""
+    rows = [
+        "3 0.5 1.3 0.05 0.95 0 0",
+        "1 0.5 1.1 0.05 0.05 0 0",
+        "4 0.5 1.4 0.95 0.95 0 0",
+        "2 0.5 1.2 0.95 0.05 0 0.1",
+    ]
+    head = "ITEM: TIME\n{0}\nITEM: TIMESTEP\n{0}\nITEM: NUMBER OF ATOMS\n4\nITEM: BOX BOUNDS pp pp ff\n0 1.8\n0 1.8\n-1 1\n"
+    body = "ITEM: ATOMS id radius mass xu yu vx vy\n" + "\n".join(rows) + "\n"
+    path = tmp_path / "grains.dump"
+    path.write_text(head.format(0) + body + head.format(1) + body)
+    frames = tc.read_frames(path)
+    made = frames.network(stiffness=2.0)
+    assert made.masses.tolist() == [1.1, 1.2, 1.3, 1.4]
+    assert made.n_contacts == 8  # each touches both copies of two others, at 0.9
+    assert float((made.overlaps - 0.1).abs().max()) < 1e-12
+    expected = tc.packing(
+        frames.first.positions,
+        frames.radii,
+        frames.masses,
+        torch.tensor([1.8, 1.8], dtype=torch.float64),
+        stiffness=2.0,
+    )
+    assert torch.equal(made.bonds, expected.bonds)
+    assert torch.equal(made.tension, expected.tension)
+    motion = frames.trajectory(axis="all")
+    assert motion.velocity[-1].tolist() == [[0, 0], [0, 0.1], [0, 0], [0, 0]]
+    made.check_state(motion.displacement)
+    bare = tmp_path / "bare.dump"
+    bare.write_text(path.read_text().replace("radius", "unknown"))
+    with pytest.raises(FieldError, match="bare.dump, frame 1: radius must be in the file"):
+        tc.read_frames(bare).network()
