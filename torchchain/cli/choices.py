@@ -19,3 +19,5 @@ SOLVERS = (
 )  # fmt: skip
 FITS = ("analytic", "linear", "nonlinear", "adam", "projection")
 MODELS = ("paper", "exact_psi", "basis_matrix", "swing_in", "memory")
+FORMATS = ("lammps", "mercury", "xyz", "netcdf")
+UNITS = ("file", "mass", "linear", "hertz")

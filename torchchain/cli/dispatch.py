@@ -8,7 +8,19 @@ from torchchain.cli import plugins
 from torchchain.cli.calibrate import run_calibrate
 from torchchain.cli.compare import run_compare
 from torchchain.cli.family import run_family
-from torchchain.cli.flags import Calibrate, Compare, Family, Plan, Predict, Rerun, Simulate, Sweep
+from torchchain.cli.flags import (
+    Calibrate,
+    Compare,
+    Convert,
+    Family,
+    Import,
+    Plan,
+    Predict,
+    Rerun,
+    Simulate,
+    Sweep,
+)
+from torchchain.cli.imports import run_convert, run_import
 from torchchain.cli.predict import run_predict
 from torchchain.cli.rerun import rerun
 from torchchain.cli.runs import config_of, scene_of, threads_for
@@ -32,6 +44,10 @@ def run(flags: Any, arguments: list[str]) -> int:
         run_predict(flags, arguments)
     elif isinstance(flags, Compare):
         run_compare(flags, arguments)
+    elif isinstance(flags, Import):
+        run_import(flags, arguments)
+    elif isinstance(flags, Convert):
+        run_convert(flags)
     elif isinstance(flags, Sweep):
         with threads_for(flags.threads):
             run_sweep(flags, arguments)

@@ -254,9 +254,61 @@ class Sweep:
     """registers observables, methods or models of its own; repeatable"""
 
 
+@dataclass(frozen=True)
+class FileFlags:
+    """Flags of the commands that read files of other codes."""
+
+    format: Annotated[str | None, flag(choices.FORMATS, "what the file begins with")] = None
+    """of the files"""
+    time_step: Annotated[float | None, flag("FLOAT")] = None
+    """time between two step numbers, for dumps that do not state their times"""
+    masses: Annotated[str | None, flag("FLOAT|FILE")] = None
+    """where the files have none: of every particle, or a MercuryDPM .restart file"""
+
+
+@dataclass(frozen=True)
+class Import(FileFlags):
+    """A band transfer from chains that another code moved, one run a file or pattern: for calibrate --transfer."""
+
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional, flag("FILE|PATTERN ...")] = ()
+    """LAMMPS or LIGGGHTS dumps, MercuryDPM .data, extended XYZ, netCDF of convert; plain or gzip"""
+    reference: Annotated[str | None, flag("FILE", "the run's first frame")] = None
+    """chain at rest: a file, as in "{stem}.reference.dump"; {name}: of the run, {stem}: without endings, {group}: and
+    without its last number; beside the run where no folder is named"""
+    contacts: Annotated[str | None, flag("FILE|PATTERN")] = None
+    """contact lists of a run, named like the reference"""
+    boundary: Annotated[str, flag(choices.BOUNDARIES, "periodic")] = "periodic"
+    """of the chains; wavenumber bands need rings"""
+    axis: Annotated[str | None, flag(("x", "y", "z"), "the one on which the particles form a line")] = None
+    """of the chains"""
+    stiffness: Annotated[str | None, flag("FLOAT|LAW", "1, or what the units are from")] = None
+    """of the contacts, in the files' units; or linear, hertz: from force and overlap in the contact lists"""
+    units: Annotated[str, flag(choices.UNITS, "file")] = "file"
+    """file: mean mass and stiffness are 1 already; mass: the mean mass of all runs and --stiffness become 1; linear,
+    hertz: so do mean mass, contact stiffness and overlap of the contact lists"""
+    n_bands: Annotated[int, flag("INT", 32)] = 32
+    """wavenumber bands"""
+    long_time: Annotated[str, flag(("exact", "late"), "exact")] = "exact"
+    """infinite-time average: from the modes of linear undamped rings, or over the later half of the times"""
+    out: Annotated[str, flag("FOLDER", "results/import")] = "results/import"
+    """for transfer.nc, figure.png and run.json"""
+
+
+@dataclass(frozen=True)
+class Convert(FileFlags):
+    """Files of another code as one netCDF file, which is read many times faster than text."""
+
+    run: Annotated[str, tyro.conf.Positional, flag("FILE|PATTERN")] = ""
+    """LAMMPS or LIGGGHTS dump, MercuryDPM .data, extended XYZ; plain or gzip; of a pattern all files, one after the other"""
+    out: Annotated[str, tyro.conf.Positional, flag("FILE")] = ""
+    """netCDF file to be written"""
+    contacts: Annotated[str | None, flag("FILE|PATTERN")] = None
+    """contact lists"""
+
+
 COMMANDS: dict[str, Any] = {
     "simulate": Simulate, "calibrate": Calibrate, "predict": Predict, "family": Family, "plan": Plan, "rerun": Rerun,
-    "compare": Compare, "sweep": Sweep,
+    "compare": Compare, "sweep": Sweep, "import": Import, "convert": Convert,
 }  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,16 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain._version import __version__
+from torchchain.chain.chain import Chain
 from torchchain.chain.excitation import StandingWave
+from torchchain.chain.states import Trajectory
 from torchchain.energy.bands import band_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.checkpoint import Checkpoint
+from torchchain.ensemble.imported import gathered
 from torchchain.ensemble.labels import ordered_error, scene_attributes, time_coordinates
 from torchchain.ensemble.layout import BLOCKS
+from torchchain.ensemble.mixed_starts import fit_transfer
 from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.ranks import ALONE, Ranks
 from torchchain.ensemble.run import ensemble_moments
@@ -35,6 +40,8 @@ from torchchain.threads import single_thread
 
 THEORY = "theory"
 """The method of a transfer without chains."""
+OF_RUNS = ("mass_mean", "mass_sd", "start_condition")
+"""Attributes of a transfer from runs of another code."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,9 @@ class BandTransfer(Printed):
         block_long_time: [block, source, receiver], or None.
         block_counts: realizations (of opposite ones, pairs) in each block.
         attributes: of a simulation the realized mean and standard deviation of the masses, ``mass_mean`` and
-            ``mass_sd``, the ``method`` that evolved the chains and, as JSON, its ``method_options``.
+            ``mass_sd``, the ``method`` that evolved the chains and, as JSON, its ``method_options``; of imported runs the
+            moments of the masses where they are known, and ``start_condition``, the condition number of the least squares
+            over their starts (1: each run starts in one band).
         provenance: where it comes from; of a simulation, left out, its scene.
         systematic: of a transfer from theory, estimated total variation distance from an endless ensemble, [source, time];
             else None.
@@ -209,6 +218,10 @@ class BandTransfer(Printed):
         if "scene" in data.attrs or "provenance_kind" not in data.attrs:
             scene, moments = _scene_of(data)
             attributes |= moments
+        else:
+            attributes |= {
+                name: checks.number(f"data.{name}", data.attrs[name]) for name in OF_RUNS if name in data.attrs
+            }
 
         def tensor(name: str) -> Tensor:
             values = np.array(data[name].values)
@@ -266,7 +279,12 @@ class BandTransfer(Printed):
 
     @classmethod
     def from_energies(
-        cls, times: Any, energies: Any, long_time: Any = None, provenance: str | Provenance = ""
+        cls,
+        times: Any,
+        energies: Any,
+        long_time: Any = None,
+        provenance: str | Provenance = "",
+        starts: Any = None,
     ) -> BandTransfer:
         """A band transfer from band energies of any origin: experiments, or simulations of another code.
 
@@ -278,6 +296,9 @@ class BandTransfer(Printed):
                 default it is taken over the later half of the times; its standard error then holds the difference
                 between the two quarters, as what has not settled would give.
             provenance: where the data come from, in words.
+            starts: shares of the energy at time 0, (realization, source, band), for runs that start in several bands at
+                once: sources are then runs, as many as there are, and the transfer is their least-squares fit
+                (see :func:`torchchain.ensemble.mixed_starts.fit_transfer`).
 
         Returns:
             BandTransfer whose scene is None; standard errors and blocks are those of the realizations.
@@ -290,28 +311,149 @@ class BandTransfer(Printed):
         2
 
         Raises:
-            FieldError, FieldTypeError: for times, shapes or numbers that are none of a transfer.
+            FieldError, FieldTypeError: for times, shapes or numbers that are none of a transfer, and for starts that do
+                not tell the bands apart.
         """
         times, energies = checks.times("times", times), checks.real_tensor("energies", energies)
-        if energies.ndim != 4 or energies.shape[1] != energies.shape[3] or energies.shape[2] != len(times):
-            rule = f"have the axes (realization, source, time, receiver) with {len(times)} times and as many sources as receivers"
+        square = starts is not None or energies.ndim != 4 or energies.shape[1] == energies.shape[3]
+        if energies.ndim != 4 or not square or energies.shape[2] != len(times):
+            as_many = "" if starts is not None else " and as many sources as receivers"
+            rule = f"have the axes (realization, source, time, receiver) with {len(times)} times{as_many}"
             raise checks.fail("energies", rule, f"shape {tuple(energies.shape)}")
         if not len(energies):
             raise checks.fail("energies", "hold at least one realization", "none")
-        if not isinstance(provenance, Provenance):
-            checks.instance("provenance", provenance, str)
-            provenance = Provenance("imported", provenance)
-        energies, blocks = energies.detach().cpu().double(), min(BLOCKS, len(energies))
-        numbers = hashlib.sha256(energies.contiguous().numpy().tobytes() + times.double().numpy().tobytes())
-        provenance = replace(provenance, hashes={**provenance.hashes, "energies": numbers.hexdigest()})
+        times, energies = times.detach().cpu().double(), energies.detach().cpu().double()
+        provenance = _imported(provenance, times, energies)
+        if starts is not None:
+            starts = checks.real_tensor("starts", starts).detach().cpu().double()
+            expected = (*energies.shape[:2], energies.shape[3])
+            if tuple(starts.shape) != expected:
+                raise checks.fail("starts", f"have shape {expected}", f"shape {tuple(starts.shape)}")
+            late = None if long_time is None else checks.real_tensor("long_time", long_time).cpu().double()
+            per_run = late is not None and late.ndim == 3
+            if late is not None and per_run:
+                if tuple(late.shape) != expected:
+                    raise checks.fail(
+                        "long_time", f"have shape {expected[2:] * 2} or {expected}", f"shape {tuple(late.shape)}"
+                    )
+                late = late.flatten(0, 1)
+            realization = torch.arange(len(energies)).repeat_interleave(energies.shape[1])
+            flat = starts.flatten(0, 1), energies.flatten(0, 1)
+            return _fitted(times, *flat, late, realization, provenance, per_run)
         average, unsettled = (
             _late_average(times, energies) if long_time is None else _given_average(energies, long_time)
         )
-        moments = EnsembleMoments(len(energies), blocks)
+        moments = EnsembleMoments(len(energies), min(BLOCKS, len(energies)))
         moments.add(0, {"band_energy": energies, "long_time_band_energy": average})
-        transfer = _from_moments(None, times.cpu().double(), moments, {}, provenance)
+        transfer = _from_moments(None, times, moments, {}, provenance)
         assert transfer.long_time_stderr is not None
         return replace(transfer, long_time_stderr=(transfer.long_time_stderr.square() + unsettled.square()).sqrt())
+
+    @classmethod
+    def from_trajectories(
+        cls,
+        chains: Chain | Iterable[Chain],
+        trajectories: Trajectory | Iterable[Trajectory],
+        n_bands: int,
+        long_time: Any = None,
+        provenance: str | Provenance = "",
+    ) -> BandTransfer:
+        """A band transfer from the motion of chains, simulated by any code: the bands each run starts in are found.
+
+        Runs that all start in one band each (0.99 of the energy in their first frame) are averaged; of runs that start in
+        several bands at once, or leave out some band on some chain, the transfer is the least-squares fit. Runs on
+        chains of equal masses are runs of one realization.
+
+        Args:
+            chains: one for each run, linear, with an even number of particles; or one with batch axes.
+            trajectories: one for each chain, all with the same times, (*batch, *any, time, particle); may be a generator
+                that reads one after the other.
+            n_bands: B.
+            long_time: infinite-time average, (source, receiver); "late" for that over the later half of the times; by
+                default the exact one from the modes of the chains, if all are undamped rings, else "late".
+            provenance: where the runs come from, in words.
+
+        Returns:
+            BandTransfer whose scene is None, with the attributes ``mass_mean``, ``mass_sd`` and ``start_condition``.
+
+        >>> import torch, torchchain as tc
+        >>> chain = tc.Chain(tc.Disorder(strength=0.3).masses(32, 10, seed=0))
+        >>> start = tc.standing_wave(chain, tone=[2, 6, 10, 14])
+        >>> path = tc.evolve(chain, start, torch.arange(0.0, 20.0))
+        >>> tc.BandTransfer.from_trajectories(chain, path, n_bands=4).mean.shape
+        torch.Size([4, 20, 4])
+
+        Raises:
+            FieldError, FieldTypeError: naming the run, for one whose times or particles are not those of the first or that
+                has no energy; and for starts that leave out a band or do not tell the bands apart.
+        """
+        n_bands = checks.integer("n_bands", n_bands, 1)
+        if isinstance(long_time, str):
+            checks.choice("long_time", long_time, ("late",))
+        runs = gathered(chains, trajectories, n_bands, exact=long_time is None)
+        late = runs.long_time if long_time is None or isinstance(long_time, str) else long_time
+        attributes = {"mass_mean": float(runs.masses.mean()), "mass_sd": float(runs.masses.std(correction=0))}
+        table = runs.table()
+        if table is not None:
+            late = runs.long_time[table] if runs.long_time is not None else late
+            made = cls.from_energies(runs.times, runs.energies[table], late, provenance)
+            return replace(made, attributes={**attributes, "start_condition": 1.0})
+        if late is not None:
+            late = checks.real_tensor("long_time", late).cpu().double()
+        origin = _imported(provenance, runs.times, runs.energies)
+        made = _fitted(
+            runs.times, runs.starts, runs.energies, late, runs.realization, origin, runs.long_time is not None
+        )
+        return replace(made, attributes={**made.attributes, **attributes})
+
+
+def _imported(provenance: str | Provenance, times: Tensor, energies: Tensor) -> Provenance:
+    """Where the data come from, with the hash of the numbers."""
+    if not isinstance(provenance, Provenance):
+        checks.instance("provenance", provenance, str)
+        provenance = Provenance("imported", provenance)
+    numbers = hashlib.sha256(energies.contiguous().numpy().tobytes() + times.numpy().tobytes())
+    return replace(provenance, hashes={**provenance.hashes, "energies": numbers.hexdigest()})
+
+
+def _fitted(
+    times: Tensor,
+    starts: Tensor,
+    energies: Tensor,
+    late: Tensor | None,
+    realization: Tensor,
+    provenance: Provenance,
+    per_run: bool,
+) -> BandTransfer:
+    """The least-squares transfer of runs (run, band), (run, time, band); long-time averages go through the same fit.
+
+    Args:
+        times, starts, energies, realization, provenance, per_run: of the runs.
+        late: with ``per_run`` (run, band); else (source, receiver), which is taken as exact; None for the later half of
+            the times.
+    """
+    n, ends = energies.shape[2], [energies[:, :0]]
+    if late is None:
+        later = energies[:, 2 * times >= times[-1]]
+        halves = [part if part.shape[1] else later for part in later.tensor_split(2, dim=1)]
+        ends += [part.mean(1, keepdim=True) for part in (later, *halves)]
+    elif per_run:
+        ends += [late[:, None]]
+    elif tuple(late.shape) != (n, n):
+        raise checks.fail("long_time", f"have shape {(n, n)} (source, receiver)", f"shape {tuple(late.shape)}")
+    found = fit_transfer(starts, torch.cat([energies, *ends], 1), realization)
+    count = len(times)
+    given = late is not None and not per_run
+    average = late if given else found.mean[:, count]
+    error = torch.zeros(n, n, dtype=torch.float64) if given else found.stderr[:, count]
+    blocks = found.block_mean[:, :, count] if not given else torch.as_tensor(late).expand(len(found.block_counts), n, n)
+    if late is None:
+        unsettled = (found.mean[:, count + 2] - found.mean[:, count + 1]) / 2
+        error = (error.square() + unsettled.square()).sqrt()
+    return BandTransfer(
+        None, times, found.mean[:, :count], found.stderr[:, :count], average, error, found.block_mean[:, :, :count],
+        blocks, found.block_counts, {"start_condition": found.condition}, provenance,
+    )  # fmt: skip
 
 
 def _given_average(energies: Tensor, long_time: Any) -> tuple[Tensor, Tensor]:

@@ -22,9 +22,11 @@ from torchchain.frames.chains import chain as make_chain
 from torchchain.frames.doubts import check_energy, here
 from torchchain.frames.motion import displacements
 from torchchain.frames.opening import File, Place, Source, find, time_of
+from torchchain.frames.packings import network as make_network
 from torchchain.frames.record import Box, Contacts, Frame, VectorTrajectory
 from torchchain.frames.registry import Entry, Raw
 from torchchain.frames.units import ContactUnits, fit_units, scaled_contacts
+from torchchain.network import Packing
 
 
 def read_frames(
@@ -275,7 +277,7 @@ class Frames:
 
         Returns:
             Trajectory with times counted from the first frame, and displacement and velocity (time, particle) in the order of
-            :meth:`chain`; or VectorTrajectory, (time, particle, axis).
+            :meth:`chain`; or VectorTrajectory, (time, particle, axis), in the order of the ids and of :meth:`network`.
 
         Raises:
             FieldError: for other particles than the reference's, for neighbors that pass each other, without velocities or times.
@@ -295,6 +297,30 @@ class Frames:
                 )
             check_energy(self.name, chain, found)
         return found
+
+    def network(
+        self,
+        reference: Source | Frames | Frame | None = None,
+        *,
+        stiffness: float = 1.0,
+        contact: str = "linear",
+        damping: float = 0.0,
+        prestress: bool = True,
+    ) -> Packing:
+        """The network of these particles where they overlap: disks or spheres, in the order of the ids, in their box.
+
+        Args:
+            reference: the state at rest, as for :meth:`trajectory`; by default the first frame.
+            stiffness, contact, damping, prestress: as for :func:`torchchain.packing`, in the units of the frames.
+
+        Returns:
+            Packing, whose states have the axes (particle, axis) that the file holds.
+
+        Raises:
+            FieldError: without masses or radii.
+        """
+        at_rest, _ = self._reference(reference)
+        return make_network(self.name, self.first, at_rest, stiffness, contact, damping, prestress)
 
     def _reference(self, reference: Source | Frames | Frame | None) -> tuple[Frame, str]:
         if reference is None:

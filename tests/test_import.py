@@ -1,0 +1,420 @@
+"""Runs of other codes, from their files to a calibrated model: in Python and by the command."""
+
+import dataclasses
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchchain as tc
+from torchchain import cli
+from torchchain.checks import FieldError, FieldTypeError
+from torchchain.cli import choices, flags, outputs
+from torchchain.frames import FORMATS
+
+DUMPS = Path(__file__).parent / "data" / "lammps"
+RUNS, REFERENCE = str(DUMPS / "linear-*.dump.gz"), "{group}.reference.dump"
+GOOD = ["--reference", REFERENCE, "--n-bands", "3"]
+N, B = 32, 4
+TIMES = torch.arange(0.0, 12.0, dtype=torch.float64)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the command in a folder of its own; returns the exit status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments):
+        capsys.readouterr()
+        status = cli.main([str(argument) for argument in arguments])
+        return status, *capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture
+def no_drawing(monkeypatch):
+    """Figures are made but not rendered, which takes longer than all the rest of a small run."""
+    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
+
+
+def scene(**more):
+    fields = {"n_particles": N, "n_bands": B, "realizations": 5, "times": TIMES, "disorder": tc.Disorder(strength=0.3)}
+    return tc.Scene(**fields | more)
+
+
+def moved(chain, state):
+    return tc.evolve(chain, state, TIMES, method="modes")
+
+
+def singly(chain, path):
+    """The runs of a batch (realization, source, ...) one by one."""
+    chains, paths = [], []
+    for r, masses in enumerate(chain.masses):
+        for s in range(path.displacement.shape[1]):
+            chains.append(dataclasses.replace(chain, masses=masses))
+            paths.append(tc.Trajectory(path.times, path.displacement[r, s], path.velocity[r, s]))
+    return chains, paths
+
+
+def mixed(chain, n_runs, seed=0):
+    """Starts that are random sums of standing waves, (realization, run, particle)."""
+    waves = tc.standing_wave(chain, list(range(1, N // 2)), amplitude=1e-3).displacement
+    generator = torch.Generator().manual_seed(seed)
+    shape = (len(chain.masses), n_runs, waves.shape[1])
+    sums = torch.einsum("rnw,rwx->rnx", torch.randn(shape, dtype=torch.float64, generator=generator), waves)
+    return tc.State(sums, torch.zeros_like(sums))
+
+
+# In Python
+
+
+def test_dumps_to_a_model_in_six_lines():
+    frames = [tc.read_frames(DUMPS / f"linear-{r}-{s}.dump.gz") for r in (1, 2) for s in (1, 2, 3)]
+    chains = [each.chain("periodic") for each in frames]
+    references = [DUMPS / f"linear-{r}.reference.dump.gz" for r in (1, 2) for s in (1, 2, 3)]
+    paths = [each.trajectory(reference) for each, reference in zip(frames, references, strict=True)]
+    transfer = tc.BandTransfer.from_trajectories(chains, paths, n_bands=3, provenance="LAMMPS, harmonic bonds")
+    master = tc.calibrate(transfer)
+
+    assert master.n_bands == 3
+    # The same chains by the library, exactly: LAMMPS's time step of 0.005 leaves (w dt)^2 / 24 t = 2e-5 of the phase.
+    chain = tc.Chain(torch.stack([chains[0].masses, chains[3].masses]))
+    start = tc.standing_wave(chain, [1, 3, 5])
+    path = tc.evolve(chain, start, transfer.times, method="modes")
+    exact = tc.band_energy(chain, path, 3).mean(0)
+    assert float((transfer.mean - exact).abs().max()) < 1e-3
+    assert float((transfer.long_time - tc.long_time_band_energy(chain, start, 3).mean(0)).abs().max()) < 1e-9
+    assert transfer.attributes["start_condition"] == 1
+    assert transfer.scene is None
+
+
+def test_trajectories_give_the_transfer_of_the_ensemble():
+    expected = tc.band_transfer(scene(), method="modes")
+    chain = scene().chain(range(5))
+    path = moved(chain, scene().state(chain))
+    found = tc.BandTransfer.from_trajectories(chain, path, B)
+    for name in ("mean", "stderr", "long_time", "long_time_stderr"):
+        assert float((getattr(found, name) - getattr(expected, name)).abs().max()) < 1e-10, name
+    assert found.attributes["mass_mean"] == pytest.approx(expected.attributes["mass_mean"], rel=1e-12)
+    assert found.attributes["mass_sd"] == pytest.approx(expected.attributes["mass_sd"], rel=1e-10)
+
+    chains, paths = singly(chain, path)
+    order = torch.randperm(len(chains), generator=torch.Generator().manual_seed(3)).tolist()
+    shuffled = tc.BandTransfer.from_trajectories([chains[i] for i in order], (paths[i] for i in order), B)
+    assert float((shuffled.mean - found.mean).abs().max()) < 1e-12
+    assert float((shuffled.stderr - found.stderr).abs().max()) < 1e-12
+    assert shuffled.block_counts == found.block_counts
+
+
+def test_a_band_that_a_chain_lacks():
+    """Of pure starts with gaps each source is the mean of its own runs."""
+    chain = scene().chain(range(5))
+    chains, paths = singly(chain, moved(chain, scene().state(chain)))
+    transfer = tc.BandTransfer.from_trajectories(chains[:-1], paths[:-1], B)
+    energies = torch.stack([tc.band_energy(c, p, B) for c, p in zip(chains, paths, strict=True)])
+    for source in range(B):
+        own = energies[source::B][: 5 - (source == B - 1)]
+        assert float((transfer.mean[source] - own.mean(0)).abs().max()) < 1e-12
+    # All starts count alike, but for the one that is missing: sqrt(5 / 5) after scaling.
+    assert transfer.attributes["start_condition"] == pytest.approx(1, abs=1e-12)
+
+
+def test_mixed_starts_go_through_least_squares(tmp_path):
+    chain = scene(realizations=8).chain(range(8))
+    start = mixed(chain, 3)
+    path = moved(chain, start)
+    transfer = tc.BandTransfer.from_trajectories(chain, path, B)
+    energies = tc.band_energy(chain, path, B).flatten(0, 1)
+    starts = energies[:, 0]
+
+    def solved(values):
+        return torch.linalg.solve(starts.T @ starts, starts.T @ values)
+
+    for t in (0, 5, 11):
+        assert float((transfer.mean[:, t] - solved(energies[:, t])).abs().max()) < 1e-9
+    late = tc.long_time_band_energy(chain, start, B).flatten(0, 1)
+    assert float((transfer.long_time - solved(late)).abs().max()) < 1e-9
+    scaled = starts / starts.norm(dim=0)
+    assert transfer.attributes["start_condition"] == pytest.approx(float(torch.linalg.cond(scaled)), rel=1e-9)
+    assert transfer.block_counts == (1,) * 8
+    # from_energies with the same starts is the same.
+    shaped = energies.reshape(8, 3, len(TIMES), B)
+    same = tc.BandTransfer.from_energies(TIMES, shaped, late.reshape(8, 3, B), starts=shaped[:, :, 0])
+    for name in ("mean", "stderr", "long_time", "long_time_stderr"):  # shares of order 1, condition below 100
+        assert float((getattr(same, name) - getattr(transfer, name)).abs().max()) < 1e-9, name
+    transfer.save(tmp_path / "transfer.nc")
+    again = tc.BandTransfer.load(tmp_path / "transfer.nc")
+    assert again.attributes == transfer.attributes
+    assert torch.equal(again.mean, transfer.mean)
+
+
+def test_as_many_mixed_runs_as_bands():
+    """Where the long-time average of the runs has the shape of one of the bands, it is still that of the runs."""
+    chain = scene(realizations=1).chain([0])
+    start = mixed(chain, B)
+    transfer = tc.BandTransfer.from_trajectories(chain, moved(chain, start), B)
+    late = tc.long_time_band_energy(chain, start, B)[0]
+    starts = tc.band_energy(chain, moved(chain, start), B)[0, :, 0]
+    assert float((starts @ transfer.long_time - late).abs().max()) < 1e-9
+    assert bool(transfer.stderr.isinf().all())
+
+
+def test_a_known_transfer_is_recovered_from_starts():
+    generator = torch.Generator().manual_seed(0)
+    known = torch.softmax(torch.randn(B, 7, B, dtype=torch.float64, generator=generator), -1)
+    starts = torch.rand(20, 2, B, dtype=torch.float64, generator=generator)
+    energies = torch.einsum("nxs,str->nxtr", starts, known)
+    times = torch.arange(7.0)
+    found = tc.BandTransfer.from_energies(times, energies, starts=starts)
+    assert float((found.mean - known).abs().max()) < 1e-11
+    assert float((found.long_time - known[:, 3:].mean(1)).abs().max()) < 1e-11
+    # What has not settled is in the error: half the difference of the two quarters.
+    drift = (known[:, 5:].mean(1) - known[:, 3:5].mean(1)).abs() / 2
+    assert bool((found.long_time_stderr > drift - 1e-11).all())
+    exact = tc.BandTransfer.from_energies(times, energies, known[:, -1], starts=starts)
+    assert torch.equal(exact.long_time, known[:, -1])
+    assert float(exact.long_time_stderr.max()) == 0
+
+
+def test_the_late_part_serves_where_modes_do_not():
+    ring = scene().chain(range(5))
+    damped = dataclasses.replace(ring, damping=0.05)
+    path = tc.evolve(damped, scene().state(ring), TIMES, method="damped")
+    found = tc.BandTransfer.from_trajectories(damped, path, B)
+    late = tc.BandTransfer.from_trajectories(ring, path, B, long_time="late")
+    assert torch.equal(found.long_time, late.long_time)
+    energies = tc.band_energy(ring, path, B)
+    assert float((found.long_time - energies[:, :, TIMES >= 5.5].mean((0, 2))).abs().max()) < 1e-12
+    given = torch.eye(B, dtype=torch.float64)
+    assert torch.equal(tc.BandTransfer.from_trajectories(ring, path, B, long_time=given).long_time, given)
+
+
+def test_what_is_wrong_is_named():
+    chain = scene().chain(range(5))
+    chains, paths = singly(chain, moved(chain, scene().state(chain)))
+    build = tc.BandTransfer.from_trajectories
+    with pytest.raises(FieldError, match="trajectories must be as many as chains, got 19 of them"):
+        build(chains, paths[:-1], B)
+    with pytest.raises(FieldError, match="trajectories must be as many as chains, got more than 19"):
+        build(chains[:-1], paths, B)
+    with pytest.raises(FieldError, match="chains must be at least one"):
+        build([], [], B)
+    with pytest.raises(FieldTypeError, match="chains, run 1 must be a Chain, got 3"):
+        build([3], paths, B)
+    with pytest.raises(FieldTypeError, match="chains must be one for each run, got 3"):
+        build(3, paths, B)
+    other = tc.Trajectory(TIMES[:-1], paths[1].displacement[:-1], paths[1].velocity[:-1])
+    with pytest.raises(FieldError, match=r"run 2: times must be those of the first run \(12 to 11\), got 11 to 10"):
+        build(chains, [paths[0], other, *paths[2:]], B)
+    still = tc.Trajectory(TIMES, torch.zeros_like(paths[0].displacement), torch.zeros_like(paths[0].velocity))
+    with pytest.raises(FieldError, match="run 1: total energy must be positive"):
+        build(chains[:1], [still], B)
+    with pytest.raises(FieldError, match="starts must excite every band in some run, got none in band 4"):
+        build(chains[:3], paths[:3], B)
+    c, p = singly(chain, moved(chain, mixed(chain, 2)))
+    with pytest.raises(FieldError, match="starts must tell the 4 bands apart .* got infinite with 2 runs"):
+        build(c[:2], p[:2], B)
+    with pytest.raises(FieldError, match="long_time must be one of late"):
+        build(chains, paths, B, long_time="early")
+    with pytest.raises(FieldError, match=r"starts must have shape \(5, 2, 4\)"):
+        tc.BandTransfer.from_energies([0.0, 1.0], torch.rand(5, 2, 2, 4), starts=torch.rand(5, 3, 4))
+
+
+# The commands
+
+
+def test_import_calibrate_predict(run, tmp_path):
+    status, output, errors = run("import", RUNS, *GOOD, "--out", "data")
+    assert (status, errors) == (0, "")
+    assert "starts: one band each" in output
+    assert sorted(os.listdir("data")) == ["figure.png", "run.json", "transfer.nc"]
+    assert os.listdir(tmp_path) == ["data"]
+    opened = tc.open("data")
+    assert opened.scene is None
+    record = opened.record
+    assert set(record["files"]) == {"transfer.nc", "figure.png"}
+    assert len(record["inputs"]) == 8  # six runs and two references
+    for name, value in record["inputs"].items():
+        assert outputs.sha256(name) == value
+    transfer = opened.transfer
+    assert transfer.provenance.hashes | record["inputs"] == transfer.provenance.hashes
+    frames = [tc.read_frames(DUMPS / f"linear-{r}-{s}.dump.gz") for r in (1, 2) for s in (1, 2, 3)]
+    paths = [each.trajectory(DUMPS / f"{each.name[:8]}.reference.dump.gz") for each in frames]
+    direct = tc.BandTransfer.from_trajectories([each.chain() for each in frames], paths, 3)
+    assert torch.equal(transfer.mean, direct.mean)
+    assert torch.equal(transfer.long_time, direct.long_time)
+    status, output, _ = run("calibrate", "--transfer", "data", "--bootstrap", "0", "--out", "model")
+    assert status == 0
+    assert "6 runs of 12 particles" in output
+    assert run("predict", "model", "--times.stop", "10", "--out", "later")[0] == 0
+    assert tc.open("model").master.n_bands == 3
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_names_of_references(run, tmp_path):
+    """{stem}, {name}, a folder of its own, and files that are not packed."""
+    shutil.copy(DUMPS / "linear-1-1.dump.gz", tmp_path / "a.b.dump.gz")
+    shutil.copy(DUMPS / "linear-1-2.dump.gz", tmp_path / "c.dump.gz")
+    shutil.copy(DUMPS / "linear-1-3.dump.gz", tmp_path / "d.dump.gz")
+    rest = DUMPS / "linear-1.reference.dump.gz"
+    os.mkdir("at_rest")
+    for template, name in (
+        ("{stem}.reference.dump", "{}.reference.dump.gz"),
+        ("at_rest/{stem}", "at_rest/{}"),
+        ("at_rest/{name}", "at_rest/{}.dump.gz"),
+    ):
+        for stem in ("a.b", "c", "d"):
+            shutil.copy(rest, name.format(stem))
+        status, output, errors = run("import", "*.dump.gz", "--reference", template, "--n-bands", 3, "--out", "out")
+        assert (status, errors) == (0, ""), template
+        assert "3 runs of 12 particles" in output
+        for path in Path().glob("*.reference.dump.gz"):
+            path.unlink()
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_units_of_mass_and_stiffness(run, tmp_path):
+    """The same runs in other units: masses times 3, times times 2, stiffness 3 / 4, lengths as they are."""
+    for run_number in (1, 2, 3):
+        frames = tc.read_frames(DUMPS / f"linear-1-{run_number}.dump.gz")
+        rest = tc.read_frames(DUMPS / "linear-1.reference.dump.gz")
+        for each, name in ((frames, f"{run_number}.dump"), (rest, f"{run_number}.reference.dump")):
+            text = ""
+            for frame in each:
+                head = f"ITEM: TIME\n{2 * frame.time:.17g}\nITEM: TIMESTEP\n{frame.step}\nITEM: NUMBER OF ATOMS\n12\n"
+                text += head + "ITEM: BOX BOUNDS pp pp pp\n0 12\n-2 2\n-2 2\nITEM: ATOMS id mass xu vx\n"
+                for i in range(12):
+                    values = (3 * frame.masses[i], frame.positions[i, 0], frame.velocities[i, 0] / 2)
+                    text += f"{i + 1} {' '.join(f'{float(v):.17g}' for v in values)}\n"
+            (tmp_path / name).write_text(text)
+    words = ["--reference", "{stem}.reference.dump", "--n-bands", 3]
+    status, _, errors = run("import", "?.dump", *words, "--units", "mass", "--stiffness", 0.75, "--out", "scaled")
+    assert (status, errors) == (0, "")
+    run("import", str(DUMPS / "linear-1-?.dump.gz"), *GOOD, "--out", "plain")
+    scaled, plain = tc.open("scaled").transfer, tc.open("plain").transfer
+    assert scaled.attributes["mass_mean"] == pytest.approx(1, abs=1e-12)
+    assert (
+        float((scaled.mean - plain.mean).abs().max()) < 1e-6
+    )  # the dumps round at 1e-15 of positions for waves of 0.01
+    ratio = scaled.times[-1] / plain.times[-1]
+    assert float(ratio) == pytest.approx(plain.attributes["mass_mean"] ** -0.5, rel=1e-12)
+
+
+def test_convert(run, tmp_path):
+    source = DUMPS / "linear-1-1.dump.gz"
+    status, output, errors = run("convert", source, "one.nc")
+    assert (status, errors) == (0, "")
+    assert "6 frames of 12 particles" in output
+    assert os.listdir(tmp_path) == ["one.nc"]
+    assert torch.equal(tc.read_frames("one.nc").positions, tc.read_frames(source).positions)
+
+
+MISTAKES = [
+    ("import", "runs must be at least one file"),
+    ("import nothing*.dump", "runs must match at least one file, got 'nothing*.dump'"),
+    ("import nothing.dump", "runs must be files, got no file nothing.dump"),
+    ("import .", "runs must be files, got a folder"),
+    ("import RUN RUN", "runs must be given once"),
+    ("import RUN --reference {step}.dump", "reference must be a file name that holds no other braces"),
+    ("import RUN --reference no.dump", "reference must be a file beside linear-1-1.dump.gz, got no file"),
+    ("import RUN --boundary fixed", "boundary must be 'periodic' for wavenumber bands"),
+    ("import RUN --n-bands 5", "n_bands must divide the number of tones n_particles/2 = 6, got 5"),
+    ("import RUN --n-bands 0", "n_bands must be at least 1"),
+    ("import RUN --n-bands 3", "linear-1-1.dump.gz: total energy must be positive"),
+    ("import RUN --n-bands 3 --reference {group}.reference.dump", "starts must excite every band in some run, got none in band 2"),
+    ("import RUN --units hertz", "contacts must be given for units hertz"),
+    ("import RUN --stiffness linear", "contacts must be given for stiffness linear"),
+    ("import RUN --stiffness soft", "stiffness must be a number, linear or hertz, got 'soft'"),
+    ("import RUN --n-bands 3 --axis y", "linear-1-1.dump.gz, frame 1: y must be in the file"),
+    ("import RUN --time-step 1", "time_step must be left out"),
+    ("import RUN --masses 1", "masses must be left out"),
+    ("import RUN --format xyzz", "format must be one of lammps, mercury, xyz, netcdf"),
+    ("import KINETIC", "linear.kinetic.txt, frame 1: header must give"),
+    ("convert", "run must be a file"),
+    ("convert RUN", "out must be a file"),
+    ("convert nothing.dump one.nc", "path must be a file that can be read, got nothing.dump"),
+    ("convert RUN nowhere/one.nc", "out must be a file in a folder that is there"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES)
+def test_mistakes_are_one_line(words, message, run, tmp_path):
+    files = {"RUN": str(DUMPS / "linear-1-1.dump.gz"), "KINETIC": str(DUMPS / "linear.kinetic.txt")}
+    status, output, errors = run(*(files.get(word, word) for word in words.split()))
+    assert status == 2
+    assert output == ""
+    assert errors.startswith("torchchain: error: ")
+    assert message in errors
+    assert errors.count("\n") == 1
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("word", ["nan", "-inf", "-1", "1e300", "word", "", "99999999999999999999"])
+@pytest.mark.parametrize("flag", sorted({e.name for e in dataclasses.fields(flags.Import)} - {"runs", "out"}))
+def test_hostile_words(flag, word, run, tmp_path):
+    begin = ["import", DUMPS / "linear-1-1.dump.gz", "--n-bands", "3"]
+    status, output, errors = run(*begin, f"--{flag.replace('_', '-')}", word)
+    assert status == 2
+    assert output == ""
+    assert errors.startswith("torchchain: error: ")
+    assert errors.count("\n") == 1
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_failed_write_leaves_what_was_there(run, tmp_path, monkeypatch):
+    def broken(drawn):
+        def writer(path):
+            raise OSError(28, "No space left on device")
+
+        return writer
+
+    monkeypatch.setattr(outputs, "figure", broken)
+    status, _, errors = run("import", RUNS, *GOOD, "--out", "data")
+    assert status == 2
+    assert "No space left on device" in errors
+    assert not (tmp_path / "data").exists() or os.listdir("data") == []
+
+
+def test_help_lists_the_formats():
+    assert tuple(name for name, known in FORMATS.items() if known.holds == "particles") == choices.FORMATS
+
+
+# Networks
+
+
+def test_grains_of_a_dump_are_a_packing(tmp_path):
+    """Four disks in a periodic square: contacts across the box, masses and frames in the order of the ids."""
+    rows = [
+        "3 0.5 1.3 0.05 0.95 0 0",
+        "1 0.5 1.1 0.05 0.05 0 0",
+        "4 0.5 1.4 0.95 0.95 0 0",
+        "2 0.5 1.2 0.95 0.05 0 0.1",
+    ]
+    head = "ITEM: TIME\n{0}\nITEM: TIMESTEP\n{0}\nITEM: NUMBER OF ATOMS\n4\nITEM: BOX BOUNDS pp pp ff\n0 1.8\n0 1.8\n-1 1\n"
+    body = "ITEM: ATOMS id radius mass xu yu vx vy\n" + "\n".join(rows) + "\n"
+    path = tmp_path / "grains.dump"
+    path.write_text(head.format(0) + body + head.format(1) + body)
+    frames = tc.read_frames(path)
+    made = frames.network(stiffness=2.0)
+    assert made.masses.tolist() == [1.1, 1.2, 1.3, 1.4]
+    assert made.n_contacts == 8  # each touches both copies of two others, at 0.9
+    assert float((made.overlaps - 0.1).abs().max()) < 1e-12
+    expected = tc.packing(
+        frames.first.positions,
+        frames.radii,
+        frames.masses,
+        torch.tensor([1.8, 1.8], dtype=torch.float64),
+        stiffness=2.0,
+    )
+    assert torch.equal(made.bonds, expected.bonds)
+    assert torch.equal(made.tension, expected.tension)
+    motion = frames.trajectory(axis="all")
+    assert motion.velocity[-1].tolist() == [[0, 0], [0, 0.1], [0, 0], [0, 0]]
+    made.check_state(motion.displacement)
+    bare = tmp_path / "bare.dump"
+    bare.write_text(path.read_text().replace("radius", "unknown"))
+    with pytest.raises(FieldError, match="bare.dump, frame 1: radius must be in the file"):
+        tc.read_frames(bare).network()

@@ -1,0 +1,281 @@
+"""``torchchain import`` and ``torchchain convert``: runs of other codes."""
+
+from __future__ import annotations
+
+import glob
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchchain import checks, plots
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import Trajectory
+from torchchain.cli import choices, outputs
+from torchchain.cli.flags import Convert, FileFlags, Import
+from torchchain.energy.bands import check_bands
+from torchchain.ensemble.stages import Stages
+from torchchain.ensemble.transfer import BandTransfer, Provenance
+from torchchain.frames import ContactUnits, Frames, convert, read_frames
+from torchchain.frames.units import LAWS
+from torchchain.progress import log
+
+ENDINGS = r"(\.(gz|dump|lammpstrj|lammps|liggghts|data|xyz|extxyz|nc|txt|local|fstat))+$"
+
+
+@dataclass(frozen=True)
+class RunFiles:
+    """The files of one run.
+
+    Attributes:
+        path: of the run.
+        reference: the chain at rest; None for the first frame.
+        contacts: file or pattern of contact lists, or None.
+    """
+
+    path: Path
+    reference: Path | None
+    contacts: str | None
+
+    @property
+    def all(self) -> list[Path]:
+        """Every file that is read."""
+        contacts = [] if self.contacts is None else sorted(glob.glob(self.contacts)) or [self.contacts]
+        return [self.path, *([self.reference] if self.reference else []), *map(Path, contacts)]
+
+
+def run_import(flags: Import, arguments: list[str]) -> None:
+    """Read the runs, average their band energies and leave transfer, figure and record."""
+    began, stages = time.time(), Stages()
+    _check(flags)
+    files = files_of(flags)
+    with outputs.run_folder(flags.out) as out:
+        log.info("reading %d runs", len(files))
+        with stages("frames"):
+            frames, chains = _chains(flags, files)
+        with stages("transfer"):
+            transfer = _transfer(flags, files, frames, chains)
+        with stages("figure"):
+            figure = _figure(transfer)
+        runs = [
+            {name: str(path) for name, path in (("run", run.path), ("reference", run.reference), ("contacts", run.contacts)) if path}
+            for run in files
+        ]  # fmt: skip
+        assert transfer.provenance is not None
+        hashes = {name: value for name, value in transfer.provenance.hashes.items() if name != "energies"}
+        record = outputs.run_record(
+            arguments, "", "cpu", began, stages.seconds, runs=runs, inputs=hashes, summary=transfer.attributes
+        )
+        outputs.write(
+            out,
+            {
+                "transfer.nc": outputs.dataset(transfer.to_dataset()),
+                "figure.png": outputs.figure(figure),
+                outputs.RECORD: record,
+            },
+        )
+    print(transfer)
+    print("masses: mean {mass_mean:.5f}, standard deviation {mass_sd:.5f}".format(**transfer.attributes))
+    condition = transfer.attributes["start_condition"]
+    print(f"starts: {'one band each' if condition == 1 else f'mixed, least squares of condition {condition:.3g}'}")
+    print(f"{time.time() - began:.1f} s, results in {flags.out}")
+
+
+def run_convert(flags: Convert) -> None:
+    """Write the frames of a run into one netCDF file."""
+    for name in ("run", "out"):
+        if not getattr(flags, name):
+            raise checks.fail(name, "be a file", "none")
+    outputs.check_writable(Path(flags.out).parent)
+    written = convert(flags.run, flags.out, flags.contacts, **_options(flags))
+    print(f"{read_frames(written)} in {written}")
+
+
+def files_of(flags: Import) -> list[RunFiles]:
+    """The files of every run, those of a pattern in the order of the numbers in their names; references are no runs.
+
+    Raises:
+        FieldError: for a file that is not there, one given twice, or a name with an unknown part in braces.
+    """
+    if not flags.runs:
+        raise checks.fail("runs", "be at least one file or pattern", "none")
+    paths: list[Path] = []
+    for word in flags.runs:
+        found = [word] if not glob.has_magic(word) or Path(word).exists() else sorted(glob.glob(word), key=_by_number)
+        if not found or not word:
+            raise checks.fail("runs", "match at least one file", repr(word))
+        paths += map(Path, found)
+    for path in paths:
+        if not path.is_file():
+            raise checks.fail("runs", "be files", "a folder" if path.is_dir() else f"no file {path}")
+    twice = next((path for i, path in enumerate(paths) if path in paths[:i]), None)
+    if twice is not None:
+        raise checks.fail("runs", "be given once", str(twice))
+    references = {path: _reference(flags.reference, path) for path in paths}
+    at_rest = {path.resolve() for path in references.values() if path is not None and path.is_file()}
+    runs = [path for path in paths if path.resolve() not in at_rest]
+    if not runs:
+        raise checks.fail("runs", "be others than their references", str(paths[0]))
+    for path in runs:
+        reference = references[path]
+        if reference is not None and not reference.is_file():
+            raise checks.fail("reference", f"be a file beside {path.name}", f"no file {reference}")
+    contacts = {
+        path: None if flags.contacts is None else str(_beside("contacts", flags.contacts, path)) for path in runs
+    }
+    return [RunFiles(path, references[path], contacts[path]) for path in runs]
+
+
+def _by_number(name: str) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _reference(template: str | None, run: Path) -> Path | None:
+    """The file that a run's reference is said to be, or the same packed with gzip."""
+    if template is None:
+        return None
+    path = _beside("reference", template, run)
+    packed = path.with_name(f"{path.name}.gz")
+    return packed if not path.is_file() and packed.is_file() else path
+
+
+def _beside(field: str, template: str, run: Path) -> Path:
+    """The path that a template means for a run, in the run's folder if it names none."""
+    stem = re.sub(ENDINGS, "", run.name)
+    parts = {"name": run.name, "stem": stem, "group": re.sub(r"[-_.]?\d+$", "", stem)}
+    unknown = [part for part in re.findall(r"{(.*?)}", template) if part not in parts]
+    if unknown or not template:
+        raise checks.fail(
+            field, "be a file name that holds no other braces than {name}, {stem}, {group}", repr(template)
+        )
+    name = re.sub(r"{(.*?)}", lambda found: parts[found[1]], template)
+    return Path(name) if Path(name).parent != Path() else run.with_name(name)
+
+
+def _check(flags: Import) -> None:
+    """What can be said of the flags before anything is read."""
+    checks.integer("n_bands", flags.n_bands, 1)
+    checks.choice("boundary", flags.boundary, ("periodic", "fixed"))
+    if flags.boundary == "fixed":
+        raise checks.fail("boundary", "be 'periodic' for wavenumber bands", "'fixed'")
+    checks.choice("units", flags.units, choices.UNITS)
+    checks.choice("long_time", flags.long_time, ("exact", "late"))
+    if flags.axis is not None:
+        checks.choice("axis", flags.axis, ("x", "y", "z"))
+    law = flags.stiffness if isinstance(_stiffness(flags), str) else None
+    if flags.contacts is None and (law or flags.units in LAWS):
+        name, value = ("stiffness", law) if law else ("units", flags.units)
+        raise checks.fail("contacts", f"be given for {name} {value}", "none")
+
+
+def _stiffness(flags: Import) -> float | str:
+    if flags.stiffness is None:
+        return flags.units if flags.units in LAWS else 1.0
+    if flags.stiffness in LAWS:
+        return flags.stiffness
+    value = _number(flags.stiffness)
+    if value is None:
+        raise checks.fail("stiffness", "be a number, linear or hertz", repr(flags.stiffness))
+    return checks.number("stiffness", value, above=0.0)
+
+
+def _number(word: str) -> float | None:
+    """The number that a word says, or None."""
+    try:
+        return float(word)
+    except ValueError:
+        return None
+
+
+def _options(flags: FileFlags) -> dict[str, Any]:
+    options: dict[str, Any] = {"format": flags.format}
+    if flags.time_step is not None:
+        options["time_step"] = flags.time_step
+    if flags.masses is not None:
+        number = _number(flags.masses)
+        options["masses"] = flags.masses if number is None else checks.number("masses", number, above=0.0)
+    return options
+
+
+def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Chain]]:
+    """The frames of every run and its chain, in the units that are asked for."""
+    frames = [read_frames(run.path, run.contacts, **_options(flags)) for run in files]
+    units = _units(flags, frames)
+    if units is not None:
+        frames = [each.scaled(units) for each in frames]
+    stiffness = _stiffness(flags)
+    if units is not None and not isinstance(stiffness, str):
+        stiffness = stiffness / units.unit("stiffness")
+    chains = []
+    for each in frames:
+        chains.append(each.chain(flags.boundary, stiffness, axis=flags.axis))
+        check_bands(chains[-1].n_particles, flags.n_bands)
+    return frames, chains
+
+
+def _units(flags: Import, frames: list[Frames]) -> ContactUnits | None:
+    """Units common to all runs: what is 1 is a mean over all of them."""
+    if flags.units == "file":
+        return None
+    if flags.units in LAWS:
+        found = [each.fit_units(flags.units) for each in frames]
+        means = (sum(getattr(one, name) for one in found) / len(found) for name in ("mass", "stiffness", "length"))
+        return ContactUnits(*means)
+    stiffness = _stiffness(flags)
+    if isinstance(stiffness, str):
+        raise checks.fail("units", f"be '{stiffness}' for a stiffness from contact lists", "'mass'")
+    masses = [each.masses for each in frames]
+    bare = next((each.name for each, mass in zip(frames, masses, strict=True) if mass is None), None)
+    if bare is not None:
+        raise checks.fail(f"{bare}: masses", "be in the file or be given by --masses", "none")
+    return ContactUnits(float(torch.cat([mass for mass in masses if mass is not None]).mean()), stiffness, 1.0)
+
+
+def _transfer(flags: Import, files: list[RunFiles], frames: list[Frames], chains: list[Chain]) -> BandTransfer:
+    """The band transfer of the runs, one of them in memory at a time."""
+
+    def trajectories() -> Iterator[Trajectory]:
+        for run, each, chain in zip(files, frames, chains, strict=True):
+            path = each.trajectory(run.reference, axis=flags.axis, chain=chain)
+            assert isinstance(path, Trajectory), "of particles that form a chain"
+            yield path
+
+    hashes = {str(path): outputs.sha256(path) for run in files for path in run.all}
+    first = frames[0]
+    words = f"{len(files)} runs of {chains[0].n_particles} particles, {files[0].path.name}{' ...' if len(files) > 1 else ''}"
+    log.info("band energies of %s", first)
+    late = "late" if flags.long_time == "late" else None
+    try:
+        return BandTransfer.from_trajectories(
+            chains, trajectories(), flags.n_bands, late, Provenance("imported", words, hashes)
+        )
+    except checks.FieldError as error:
+        found = re.match(r"run (\d+): (.*)", str(error), re.DOTALL)
+        if found is None:
+            raise
+        rest = flags.reference is None and "total energy" in found[2]
+        hint = " (at rest in its first frame: the chain without a wave is named by --reference)" if rest else ""
+        raise checks.FieldError(f"{files[int(found[1]) - 1].path.name}: {found[2]}{hint}") from None
+
+
+def _figure(transfer: BandTransfer) -> Any:
+    """Band maps of two sources, what stays in them and comes to their neighbors, and the infinite-time average."""
+    n = transfer.n_bands
+    low, high = max(1, round(n / 3)), max(1, round(n * 2 / 3))
+    times, mean, stderr = transfer.times.numpy(), transfer.mean.numpy(), transfer.stderr.numpy()
+    figure, axes = plots.figure(9, 6.6, 2, 2)
+    for column, source in enumerate((low, high)):
+        plots.band_map(axes[0, column], times, mean[source - 1], f"source band {source}")
+        ax = axes[1, column]
+        for receiver in dict.fromkeys((source, max(1, source - 1), min(n, source + 1))):
+            index = (source - 1, slice(None), receiver - 1)
+            plots.curve(ax, times, mean[index], stderr[index], label=f"{source} to {receiver}")
+        ax.set(xlabel=plots.TIME_LABEL, ylabel="share of energy", ylim=(0, 1.05))
+        ax.legend(fontsize="small")
+    assert transfer.provenance is not None
+    figure.suptitle(transfer.provenance.words, fontsize="small")
+    return figure

@@ -1,0 +1,146 @@
+"""Runs of any code, gathered into what a band transfer is made of: band energies, starts, and which runs share a chain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain.chain import Chain
+from torchchain.chain.states import State, Trajectory
+from torchchain.energy.bands import check_bands
+from torchchain.energy.wavenumber import band_energy, long_time_band_energy
+
+PURE = 0.99
+"""Share of the energy in one band from which a run counts as one that starts in it alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Runs of an ensemble.
+
+    Attributes:
+        times: (time,), from 0.
+        energies: share of each band, (run, time, band).
+        realization: number of the chain of every run, (run,), in the order in which they came.
+        long_time: exact infinite-time average (run, band); None where some chain has none, or it was not asked for.
+        masses: of every chain, (realization, particle).
+    """
+
+    times: Tensor
+    energies: Tensor
+    realization: Tensor
+    long_time: Tensor | None
+    masses: Tensor
+
+    @property
+    def starts(self) -> Tensor:
+        """Share of each band in the first frame, (run, band); of runs that all start in one band each, zeros and ones."""
+        first = self.energies[:, 0]
+        if bool((first.amax(-1) >= PURE).all()):
+            return torch.eye(first.shape[-1], dtype=first.dtype)[first.argmax(-1)]
+        return first
+
+    def table(self) -> Tensor | None:
+        """Which run it is, (realization, source), where each chain has one run that starts in each band; else None."""
+        starts, n = self.starts, self.energies.shape[-1]
+        cell = self.realization * n + starts.argmax(-1)
+        whole = torch.arange(n * len(self.masses))
+        if not bool((starts.amax(-1) == 1).all()) or not torch.equal(cell.sort().values, whole):
+            return None
+        return cell.argsort().reshape(-1, n)
+
+
+def gathered(
+    chains: Chain | Iterable[Chain], trajectories: Trajectory | Iterable[Trajectory], n_bands: int, exact: bool
+) -> Runs:
+    """Band energies of runs, one after the other: trajectories that are read when they are asked for stay in memory singly.
+
+    Args:
+        chains, trajectories: one of each, or as many of one as of the other; those with batch axes hold several runs.
+        n_bands: B.
+        exact: also take the infinite-time average from the modes, where all chains are linear undamped rings.
+
+    Raises:
+        FieldError: naming the run, for times or a number of particles that differ from those of the first.
+    """
+    chains = [chains] if isinstance(chains, Chain) else chains
+    trajectories = [trajectories] if isinstance(trajectories, Trajectory) else trajectories
+    for name, value in (("chains", chains), ("trajectories", trajectories)):
+        if not checks.is_collection(value):
+            raise checks.FieldTypeError(f"{name} must be one for each run, got {checks.shown(value)}")
+    numbers: dict[bytes, int] = {}
+    kinds: list[tuple[Tensor, Tensor]] = []
+    times = torch.zeros(0, dtype=torch.float64)
+    energies: list[Tensor] = []
+    belongs: list[int] = []
+    firsts: list[tuple[Tensor, Tensor]] = []
+    trajectory_of = iter(trajectories)
+    run = 0
+    for run, chain in enumerate(chains, 1):
+        checks.instance(f"chains, run {run}", chain, Chain)
+        path = next(trajectory_of, None)
+        if path is None:
+            raise checks.fail("trajectories", "be as many as chains", f"{run - 1} of them")
+        checks.instance(f"trajectories, run {run}", path, Trajectory)
+        check_bands(chain.n_particles, n_bands)
+        try:
+            energy = band_energy(chain, path, n_bands)
+        except checks.FieldError as error:
+            raise checks.FieldError(f"run {run}: {error}") from None
+        own = (path.times - path.times[0]).detach().cpu().double()
+        if not energies:
+            times = own
+        _check_same(run, own, times, chain.n_particles, kinds)
+        exact = exact and chain.is_free and chain.contact == "linear" and not chain.is_damped
+        start = path.displacement[..., 0, :].detach()
+        for masses, stiffness in _of_runs(chain, start):
+            key = masses.numpy().tobytes() + stiffness.numpy().tobytes()
+            if key not in numbers:
+                numbers[key] = len(kinds)
+                kinds.append((masses, stiffness))
+            belongs.append(numbers[key])
+        energies.append(energy.detach().cpu().double().reshape(-1, *energy.shape[-2:]))
+        firsts.append((_rows(start), _rows(path.velocity[..., 0, :])))
+    if not run:
+        raise checks.fail("chains", "be at least one", "none")
+    if next(trajectory_of, None) is not None:
+        raise checks.fail("trajectories", "be as many as chains", f"more than {run}")
+    realization, together = torch.tensor(belongs), torch.cat(energies)
+    late = None
+    if exact:
+        displacement, velocity = (torch.cat(part) for part in zip(*firsts, strict=True))
+        late = torch.empty(len(together), together.shape[-1], dtype=torch.float64)
+        for number, (masses, stiffness) in enumerate(kinds):
+            mine = realization == number
+            ring = Chain(masses, "periodic", stiffness)
+            late[mine] = long_time_band_energy(ring, State(displacement[mine], velocity[mine]), n_bands)
+    return Runs(times, together, realization, late, torch.stack([masses for masses, _ in kinds]))
+
+
+def _check_same(run: int, own: Tensor, times: Tensor, n_particles: int, kinds: list[tuple[Tensor, Tensor]]) -> None:
+    """An error unless a run has the times and the number of particles of the first."""
+    # Times that a time step times a step number gives agree to rounding only.
+    if own.shape != times.shape or not torch.allclose(own, times, rtol=1e-9, atol=1e-9 * float(times[-1])):
+        raise checks.fail(
+            f"run {run}: times",
+            f"be those of the first run ({len(times)} to {float(times[-1]):g})",
+            f"{len(own)} to {float(own[-1]):g}",
+        )
+    if kinds and len(kinds[0][0]) != n_particles:
+        raise checks.fail(f"run {run}: particles", f"be {len(kinds[0][0])} as in the first run", n_particles)
+
+
+def _rows(values: Tensor) -> Tensor:
+    return values.detach().cpu().double().reshape(-1, values.shape[-1])
+
+
+def _of_runs(chain: Chain, start: Tensor) -> Iterable[tuple[Tensor, Tensor]]:
+    """Masses and contact stiffness of every run."""
+    masses = _rows(chain.align(chain.masses, start).expand(start.shape))
+    stiffness = chain.align(chain.contact_stiffness, start)
+    stiffness = _rows(stiffness.expand(*start.shape[:-1], stiffness.shape[-1]))
+    return zip(masses, stiffness, strict=True)
