@@ -11,9 +11,11 @@ import torch
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.certified import certified
 from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import FitWarning, checked_window, within
 from torchchain.master.ladder import MODELS, fitted_by, methods
+from torchchain.master.memory import MemoryModel, ProjectionReport
 from torchchain.master.model import TransferModel
 from torchchain.master.rates import RateModel
 from torchchain.master.records import Fit, NoSettings, Recipe, ReducedModel
@@ -98,7 +100,9 @@ def calibrate(
     """A master equation from the transfer of an ensemble.
 
     With neither method nor model, the smallest of the ladder's models (see :mod:`torchchain.master.ladder`) that reaches
-    the ensemble's own error on realizations it has not seen.
+    the ensemble's own error on realizations it has not seen. A model with memory of chains without damping, whose
+    order was not asked for, is then replaced by one whose energies are never negative and which starts like a chain,
+    T(t) = I + O(t^4), if that is as near to the ensemble: ``calibration.report.certificate`` holds the proof.
 
     Args:
         transfer: see :func:`torchchain.band_transfer`. Of damped chains, the damping d of Eq. 51 is calibrated too.
@@ -121,7 +125,8 @@ def calibrate(
         FieldError: for an unknown name, a window without times, a model that the method cannot fit.
 
     Warns:
-        FitWarning: naming how many entries of the nonlinear fit did not converge, or that Adam did not.
+        FitWarning: naming how many entries of the nonlinear fit did not converge, or that Adam did not, or a model with
+            memory that goes far outside the energy there is.
     """
     checks.instance("transfer", transfer, BandTransfer)
     asked = recipe(transfer, method, model, window, **settings)
@@ -135,12 +140,16 @@ def calibrate(
             report = replace(report, selection=selection)
         sample = Sample.of(transfer)
         fitted, told = asked.run(sample, near, shown.update)
+        free, proof = fitted, None
+        if isinstance(fitted, MemoryModel) and isinstance(told, ProjectionReport) and not sample.damped:
+            fitted, told, proof = certified(transfer, asked, (fitted, told), report.selection is not None, shown.update)
         report = replace(
-            report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=replicates
-        )
+            report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=replicates,
+            certificate=proof,
+        )  # fmt: skip
         _check_growth(fitted, asked)
         if replicates:
-            errors = draw_again(transfer, asked, fitted, replicates, shown.update)
+            errors = draw_again(transfer, asked, free, replicates, shown.update, fitted)
     return MasterEquation(fitted, _record(transfer, asked, report), errors)
 
 

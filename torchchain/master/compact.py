@@ -28,9 +28,10 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
-from torchchain.master.certificate import Certificate, nonnegative
+from torchchain.master.certificate import nonnegative
 from torchchain.master.memory import MemoryModel, fit_memory
 from torchchain.master.model import Embedding, TransferModel
+from torchchain.master.proof import Certificate
 
 LADDER = ((4, 3, 6), (6, 4, 8), (8, 5, 10), (8, 6, 12), (10, 7, 14), (12, 8, 16))
 """Degrees in place, distance and time that are tried one after the other."""

@@ -16,6 +16,7 @@ from torchchain.chain.excitation import StandingWave
 from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.scene import Scene, describe
 from torchchain.master import file
+from torchchain.master.certificate import certify
 from torchchain.master.fits import AnalyticReport
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
@@ -114,6 +115,8 @@ class MasterEquation(Printed, nn.Module):
             )
         if bool(self.damping.any()):
             rows["damping"] = f"{float(self.damping.min()):.3g} to {float(self.damping.max()):.3g} per unit time"
+        if self.calibration.report.certificate is not None:
+            rows["energies"] = "never negative, proved for all times"
         rows["conservation defect"] = f"{self.conservation_defect:.1e}"
         return rows | {"rates": self.rates_meaning}
 
@@ -281,9 +284,11 @@ class MasterEquation(Printed, nn.Module):
         tensors["damping"] = tensors["damping"] @ joined / size
         record, errors = self.calibration, self.uncertainty
         record = replace(record, scene=_joined_scene(record.scene, n_bands), report=self._joined_report(joined))
-        return MasterEquation(
-            MemoryModel(**tensors), record, None if errors is None else errors.coarsened(joined.to(errors.stderr))
-        )
+        model = MemoryModel(**tensors)
+        if self.calibration.report.certificate is not None:  # sums of what is not negative; proved again all the same
+            proof = certify(model)
+            record = replace(record, report=replace(record.report, certificate=proof if proof.holds else None))
+        return MasterEquation(model, record, None if errors is None else errors.coarsened(joined.to(errors.stderr)))
 
     def _joined_report(self, joined: Tensor) -> Report:
         loss = self.calibration.report.loss

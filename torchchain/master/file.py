@@ -6,10 +6,12 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -17,6 +19,7 @@ from safetensors.torch import save_file
 from torchchain import checks
 from torchchain._version import __version__
 from torchchain.ensemble.scene import Scene
+from torchchain.master.certificate import CertificateError, verify
 from torchchain.master.fits import checked_window
 from torchchain.master.ladder import kinds, methods
 from torchchain.master.model import TransferModel
@@ -81,13 +84,24 @@ def _described(model: TransferModel, record: Calibration) -> dict[str, Any]:
         "window": record.window,
         "scene": None if record.scene is None else record.scene.to_dict(),
         "provenance": record.provenance,
-        "report": record.report.to_dict(),
+        "report": _proved(model, record.report).to_dict(),
         "conventions": CONVENTIONS,
         "versions": {
             "torchchain": __version__,
             **{name: version(name) for name in ("torch", "numpy", "scipy", "torchdiffeq")},
         },
     }
+
+
+def _proved(model: TransferModel, report: Report) -> Report:
+    """The report, without a certificate that the model no longer meets (in single precision, or changed by hand)."""
+    if report.certificate is None:
+        return report
+    try:
+        verify(model, report.certificate)
+    except CertificateError:
+        return replace(report, certificate=None)
+    return report
 
 
 def _packed(model: TransferModel, uncertainty: Uncertainty | None) -> dict[str, torch.Tensor]:
@@ -160,7 +174,10 @@ def _member(where: str, header: dict[str, Any], tensors: dict[str, torch.Tensor]
         report = Report.from_dict(header["report"], None if fit is None else fit.report)
         if report.loss is not None and len(report.loss.rates) != model.n_bands:
             raise checks.fail("report.loss.rates", f"hold {model.n_bands} numbers", report.loss.rates)
-    except (checks.FieldError, checks.FieldTypeError, TypeError) as error:
+        if report.certificate is not None:
+            with np.errstate(all="ignore"):  # of energies that are no numbers nothing is proved
+                verify(model, report.certificate)
+    except (checks.FieldError, checks.FieldTypeError, CertificateError, TypeError) as error:
         raise checks.fail(where, "hold valid fields", f"{error}") from None
     bands = model.n_bands if scene is None else scene.n_bands
     if bands != model.n_bands or header["n_bands"] != model.n_bands:
