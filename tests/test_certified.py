@@ -170,3 +170,70 @@ def saved(master, path):
 def contents(path):
     with safe_open(path, framework="pt") as file:
         return json.loads(file.metadata()["torchchain"]), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+# The compact model, by name
+
+
+@pytest.fixture(scope="module")
+def compact(transfer):
+    return tc.calibrate(transfer, model="compact", bootstrap=6)
+
+
+def test_compact_is_selected_by_name(transfer, compact):
+    record = compact.calibration
+    assert (record.method, record.model) == ("logistic", "compact")
+    assert compact.n_parameters < 500 < B * B * 2
+    assert compact.n_parameters == len(compact.model.coefficients)
+    assert {rung.model for rung in record.report.selection.tried} == {"compact"}
+    assert record.report.fit.degrees == compact.model.degrees_
+    assert record.report.certificate.holds
+    assert compact.conservation_defect == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", tc.master.TrustWarning)  # times beyond the data
+        energies = compact.solve(starts(), LATE)
+    assert float(energies.min()) >= 0
+    assert float((energies.sum(-1) - 1).abs().max()) < 1e-12
+    halves = record.report.selection.halves_distance
+    off = tc.total_variation(compact.model.transfer(transfer.times), transfer.mean)[:, 1:].mean()
+    assert float(off) < halves
+
+
+def test_compact_error_bars_come_from_its_own_refits(transfer, compact):
+    errors = compact.uncertainty
+    for part in (errors.stderr[:, 1:], errors.rates_stderr, errors.basis_stderr):
+        assert bool(part.isfinite().all())
+        assert float(part.max()) > 0
+    # a model of few numbers averages the noise of many energies: its error is not above the ensemble's own by much
+    own = transfer.stderr[:, 1:].square().mean().sqrt()
+    assert 0.05 * own < errors.stderr[:, 1:].square().mean().sqrt() < 2 * own
+
+
+def test_compact_is_saved_and_loaded(compact, tmp_path):
+    again = tc.MasterEquation.load(saved(compact, tmp_path / "c.safetensors"))
+    assert again.model.kind == "compact"
+    assert again.calibration.report == compact.calibration.report
+    times = [0.0, 0.3, 7.0, 50.0]
+    assert torch.equal(again.transfer(times), compact.transfer(times))
+    assert torch.equal(again.standard_error(starts(1), times), compact.standard_error(starts(1), times))
+
+
+def test_compact_solves_as_a_linear_equation_nearly(compact):
+    """By the nearest model with memory: within the error bars on average."""
+    times = [0.0, 1.0, 10.0, 40.0]
+    eye = torch.eye(B, dtype=torch.float64)
+    apart = (compact.solve(eye, times, "dopri8") - compact.solve(eye, times)).abs()
+    assert float(apart.mean()) < 2 * float(compact.uncertainty.stderr.mean())
+    assert compact.coarsened(4).calibration.report.certificate.holds
+
+
+def test_compact_refuses_chains_it_is_not_made_for():
+    for change, message in (
+        ({"boundary": "fixed"}, "boundary must be periodic for model 'compact', got fixed"),
+        ({"damping": 0.1}, "damping must be 0.0 for model 'compact'"),
+    ):
+        scene = tc.Scene(n_particles=32, n_bands=4, **change)
+        with pytest.raises(FieldError, match=message):
+            tc.master.calibration.recipe(scene, model="compact")
+    with pytest.raises(FieldError, match="degrees must be at least 1"):
+        tc.master.calibration.recipe(tc.Scene(), degrees=(0, 1, 2))

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
-from torchchain.ensemble.statistics import statistical_distance, total_variation
+from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.certificate import CertificateError, certify, nonnegative
 from torchchain.master.fits import FitWarning
@@ -75,7 +74,7 @@ def certified(
 
 def _found(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitted]:
     """Models that are never negative, with the decay rates of the free fit and of fits of smaller orders."""
-    noise = _noise(transfer)
+    noise = Sample.of(transfer).distance
     for model, told in _fits(transfer, asked, free):
         assert isinstance(model, MemoryModel), "of the method 'projection'"
         try:
@@ -91,12 +90,6 @@ def _fits(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitte
     sample = Sample.of(transfer)
     for order in ORDERS[max(at - ORDERS_TRIED + 1, 0) : at][::-1]:
         yield replace(asked, settings=replace(asked.settings, order=order)).run(sample)
-
-
-def _noise(transfer: BandTransfer) -> Tensor | None:
-    """Expected total variation of two ensembles at each time, (time,); None where the ensemble does not tell."""
-    found = statistical_distance(transfer.stderr).mean(0)
-    return found if bool(found.isfinite().all()) and bool((found > 0).any()) else None
 
 
 def _distance(model: TransferModel, transfer: BandTransfer) -> float:

@@ -35,6 +35,7 @@ CONVENTIONS = {
     "markov": "e(t) = e(0) (basis exp(-damping t) + (1 - basis) exp((rates - damping) t)), row vectors",
     "swing_in": "like markov, but energy moves only after it was released from rest with the rate 1 / delay",
     "memory": "e(t) = e(0) (basis + sum_m amplitudes[m] f_m(t)) exp(-damping t); f: exponentials, then cosine and sine of pairs; rates are slopes at short times, which e(t) does not use",
+    "compact": "shares of a source's energy are the odds of damped beats of two waves, times exponentials of polynomials (coefficients) of place, distance and time, over their sum; see torchchain.master.compact",
     "bands": "n_bands equal bands of |k| in (0, pi]; tone n lies in band ceil(n / (n_particles / 2 / n_bands))",
     "units": "mean mass 1, linear contact stiffness 1; time: travel time of sound over one particle",
 }
@@ -46,6 +47,8 @@ ERROR_AXES = {
 """Of the error bars, which a file holds all or none of."""
 LONGEST_AXIS = 128
 """Functions, or times of the error bars."""
+MOST_TERMS = 2**14
+"""Of polynomials."""
 MOST_MEMBERS = 64
 
 
@@ -269,7 +272,7 @@ def _model_tensors(
         part = file.get_slice(prefix + name)
         shape = tuple(part.get_shape())
         fits = len(shape) == len(axes) and all(
-            size == header["n_bands"] if axis == "band" else size <= LONGEST_AXIS
+            size == header["n_bands"] if axis == "band" else size <= (MOST_TERMS if axis == "term" else LONGEST_AXIS)
             for size, axis in zip(shape, axes, strict=True)
         )
         if not fits:
