@@ -111,12 +111,8 @@ EVERY_FLAG = [
     for command, kind in flags.COMMANDS.items()
     for flag in flags_of(kind)
     if not (command != "simulate" and flag in SHARED)
-<<<<<<< HEAD
-    and (command, flag) not in {("predict", "model"), ("rerun", "folder"), ("family", "models"), *POSITIONAL}
-=======
     and command not in {"import", "convert"}  # in test_import.py
-    and (command, flag) not in {("predict", "model"), ("rerun", "folder"), ("family", "models")}
->>>>>>> imports
+    and (command, flag) not in {("predict", "model"), ("rerun", "folder"), ("family", "models"), *POSITIONAL}
 ]
 FREE = {"out", "config", "artifact"}  # any word may be the name of a file
 ALSO = {

@@ -17,7 +17,7 @@ SOLVERS = (
     "expm", "dopri8", "dopri5", "bosh3", "fehlberg2", "adaptive_heun", "euler", "midpoint", "heun2", "heun3", "rk4",
     "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver",
 )  # fmt: skip
-FITS = ("analytic", "linear", "nonlinear", "adam", "projection")
-MODELS = ("paper", "exact_psi", "basis_matrix", "swing_in", "memory")
+FITS = ("analytic", "linear", "nonlinear", "adam", "logistic", "projection")
+MODELS = ("paper", "exact_psi", "basis_matrix", "swing_in", "compact", "memory")
 FORMATS = ("lammps", "mercury", "xyz", "netcdf")
 UNITS = ("file", "mass", "linear", "hertz")

@@ -11,9 +11,12 @@ import torch
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.certified import certified
+from torchchain.master.compact import CompactModel
 from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import FitWarning, checked_window, within
 from torchchain.master.ladder import MODELS, fitted_by, methods
+from torchchain.master.memory import MemoryModel, ProjectionReport
 from torchchain.master.model import TransferModel
 from torchchain.master.rates import RateModel
 from torchchain.master.records import Fit, NoSettings, Recipe, ReducedModel
@@ -61,6 +64,8 @@ def recipe(
         fit.check(chosen, len(data.times))
     given = checked_window(given if window is None else window)
     if not data.is_ordered:
+        if record is not None:
+            record.check_scene(data if isinstance(data, Scene) else data.scene)
         within(data.times, given, n_times)
     return Recipe(record, fit, given, chosen)
 
@@ -98,21 +103,23 @@ def calibrate(
     """A master equation from the transfer of an ensemble.
 
     With neither method nor model, the smallest of the ladder's models (see :mod:`torchchain.master.ladder`) that reaches
-    the ensemble's own error on realizations it has not seen.
+    the ensemble's own error on realizations it has not seen. A model with memory of chains without damping, whose
+    order was not asked for, is then replaced by one whose energies are never negative and which starts like a chain,
+    T(t) = I + O(t^4), if that is as near to the ensemble: ``calibration.report.certificate`` holds the proof.
 
     Args:
         transfer: see :func:`torchchain.band_transfer`. Of damped chains, the damping d of Eq. 51 is calibrated too.
         method: "analytic": Eq. 50 with q0 fitted to the linear procedure's rates; "linear" and "nonlinear": the
             procedures L and NL of Section 3.5 on the times in the window; "adam": Q from all times, starting from L;
-            "projection": the model "memory" from all times. None for the one that fits the model best.
-        model: "paper" (basis energy Psi of Eq. 47), "exact_psi", "basis_matrix", "swing_in", "memory" (all but the
+            "projection": the model "memory" from all times; "logistic": the model "compact" from all times. None for the one that fits the model best.
+        model: "paper" (basis energy Psi of Eq. 47), "exact_psi", "basis_matrix", "swing_in", "compact", "memory" (all but the
             first need the long-time average) or a registered one; None: the richest that the method fits.
         window: first and last time of the fits at short times; None for 0.5 to 2, "nonlinear" 0.5 to 4.5.
         bootstrap: number of ensembles drawn again for the error bars, 0 for none; None for 20, or none with methods
             that would take long ("adam", "nonlinear") and with fewer than 4 blocks of realizations.
         progress: show a bar if the output is a terminal.
         settings: for "adam" the fields of :class:`AdamSettings`; for "projection" ``order``, the numbers of exponentials
-            and of pairs (none: the smallest that reaches the ensemble's own error on held-out realizations).
+            and of pairs, for "logistic" ``degrees`` in place, distance and time (none: the smallest that reaches the ensemble's own error on held-out realizations).
 
     Returns:
         MasterEquation, whose ``calibration.report`` tells how the model was chosen and fitted.
@@ -121,7 +128,8 @@ def calibrate(
         FieldError: for an unknown name, a window without times, a model that the method cannot fit.
 
     Warns:
-        FitWarning: naming how many entries of the nonlinear fit did not converge, or that Adam did not.
+        FitWarning: naming how many entries of the nonlinear fit did not converge, or that Adam did not, or a model with
+            memory that goes far outside the energy there is.
     """
     checks.instance("transfer", transfer, BandTransfer)
     asked = recipe(transfer, method, model, window, **settings)
@@ -135,12 +143,16 @@ def calibrate(
             report = replace(report, selection=selection)
         sample = Sample.of(transfer)
         fitted, told = asked.run(sample, near, shown.update)
+        free, proof = fitted, None
+        if isinstance(fitted, MemoryModel) and isinstance(told, ProjectionReport) and not sample.damped:
+            fitted, told, proof = certified(transfer, asked, (fitted, told), report.selection is not None, shown.update)
         report = replace(
-            report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=replicates
-        )
+            report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=replicates,
+            certificate=fitted.certificate if isinstance(fitted, CompactModel) else proof,
+        )  # fmt: skip
         _check_growth(fitted, asked)
         if replicates:
-            errors = draw_again(transfer, asked, fitted, replicates, shown.update)
+            errors = draw_again(transfer, asked, free, replicates, shown.update, fitted)
     return MasterEquation(fitted, _record(transfer, asked, report), errors)
 
 

@@ -9,8 +9,7 @@ time Pi is larger than all that still decays. So finitely many intervals bound T
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -22,9 +21,8 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
+from torchchain.master.proof import ROUNDING, Certificate
 
-ROUNDING = 1e-12
-"""Shares of the energy that count as zero: rounding of a sum of exponentials in float64."""
 DEGREE = 16
 REMAINDER = 1e-15
 MOST_INTERVALS = 20_000
@@ -52,46 +50,6 @@ LARGEST_AMPLITUDES = 1000.0
 
 class CertificateError(ValueError):
     """A model that was to be certified is not what its certificate says."""
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """What is proved of T(t) = Pi + sum_m A_m f_m(t), for every t >= 0.
-
-    Attributes:
-        lower: no entry of T is below it.
-        upper: none is above it.
-        drift: no row sum of T differs from 1 by more, infinity if T decays to zero (damped chains).
-        tail: from this time on Pi outweighs all that still decays.
-        intervals: of the time axis before it, that were needed.
-    """
-
-    lower: float
-    upper: float
-    drift: float
-    tail: float
-    intervals: int
-
-    @property
-    def holds(self) -> bool:
-        """Whether T is proved not to be negative, to rounding."""
-        return self.lower >= -ROUNDING
-
-    def to_dict(self) -> dict[str, Any]:
-        """For the report of a calibration; infinity as a word."""
-        return {name: "infinite" if math.isinf(value) else value for name, value in asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, record: Mapping[str, Any]) -> Certificate:
-        """The inverse of :meth:`to_dict`, checked."""
-        checks.instance("certificate", record, dict)
-        names = [entry.name for entry in fields(cls)]
-        checks.known_keys("certificate", record, names)
-        values: dict[str, Any] = {}
-        for name in names:
-            value = record.get(name, "nothing")
-            values[name] = math.inf if value == "infinite" else checks.number(f"certificate.{name}", value)
-        return cls(**values | {"intervals": checks.integer("certificate.intervals", record["intervals"], 0)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,11 +182,11 @@ def verify(model: TransferModel, certificate: Certificate) -> None:
     """Prove a model's certificate again.
 
     Raises:
-        CertificateError: if the model's energies go lower, or drift more, than the certificate says.
+        CertificateError: if the model's energies go lower or higher, or drift more, than the certificate says.
     """
     checks.instance("certificate", certificate, Certificate)
     found = certify(model)
-    for name in ("lower", "drift"):
+    for name in ("lower", "upper", "drift"):
         said, now = getattr(certificate, name), getattr(found, name)
         worse = said - now if name == "lower" else now - said
         if not (now == said or worse <= ROUNDING):
@@ -386,7 +344,10 @@ def nonnegative(
             _balance(free)
         edges, _ = _edges(Exponentials.of(built(free)))
         for points in GRID:
-            found = built(_lifted(space, free, basis.numpy(), _refined(edges, points), conserves))
+            try:
+                found = built(_lifted(space, free, basis.numpy(), _refined(edges, points), conserves))
+            except (RuntimeError, ValueError):  # nonnegative least squares did not end, or ended in no number
+                continue
             certificate = certify(found)
             if certificate.holds:
                 return found
@@ -461,6 +422,8 @@ def _push(directions: np.ndarray, short: np.ndarray, margin: np.ndarray) -> np.n
         target[-1] = 1.0
         multipliers, _ = optimize.nnls(system, target, maxiter=100 * len(cuts))
         rest = target - system @ multipliers
+        if not rest[-1] > 0:  # the constraints contradict each other
+            break
         push = scale * (system[:-1] @ multipliers) / rest[-1]
         cuts = cuts[multipliers > 0]
     return push

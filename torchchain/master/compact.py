@@ -18,9 +18,9 @@ that is fitted: a logistic regression, by Levenberg's and Marquardt's method.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,9 +28,15 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
-from torchchain.master.certificate import Certificate, nonnegative
-from torchchain.master.memory import MemoryModel, fit_memory
+from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.certificate import CertificateError, nonnegative
+from torchchain.master.fits import linear_weights
+from torchchain.master.memory import ORDERS, MemoryModel, checked_order, fit_memory
 from torchchain.master.model import Embedding, TransferModel
+from torchchain.master.proof import Certificate
+from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
+from torchchain.master.sample import Sample, block_weights
+from torchchain.threads import single_blas_thread
 
 LADDER = ((4, 3, 6), (6, 4, 8), (8, 5, 10), (8, 6, 12), (10, 7, 14), (12, 8, 16))
 """Degrees in place, distance and time that are tried one after the other."""
@@ -159,7 +165,12 @@ class CompactModel(TransferModel):
         waves: as tensors of :class:`Waves`.
     """
 
-    kind = "compact"
+    kind: ClassVar[str] = "compact"
+    axes: ClassVar[dict[str, tuple[str, ...]]] = {
+        "rates": ("band", "band"), "degrees": ("degree",), "coefficients": ("term",), "source_frequency": ("band",),
+        "source_decay": ("band",), "tone_frequency": ("band", "tone"), "tone_decay": ("band", "tone"), "coupling": (),
+    }  # fmt: skip
+    rates_meaning: ClassVar[str] = MemoryModel.rates_meaning
 
     def __init__(
         self, rates: Tensor, degrees: Tensor, coefficients: Tensor, source_frequency: Tensor, source_decay: Tensor,
@@ -186,7 +197,6 @@ class CompactModel(TransferModel):
             if name != "coefficients":
                 checks.first_bad(name, "be positive", value, ~(value > 0), "band")
             self.register_buffer(name, value.detach().clone())
-        self.register_buffer("damping", torch.zeros_like(self._rates[0]))
         self.source_frequency: Tensor
         self.source_decay: Tensor
         self.tone_frequency: Tensor
@@ -204,6 +214,15 @@ class CompactModel(TransferModel):
     def basis(self) -> Tensor:  # type: ignore[override]
         """Pi [source, receiver], T at infinite time."""
         return self._at(self._rates.new_full((1,), math.inf))[:, 0]
+
+    @property
+    def damping(self) -> Tensor:  # type: ignore[override]
+        """None, [band]."""
+        return torch.zeros_like(self._rates[0])
+
+    @property
+    def words(self) -> str:
+        return f"degrees {self.degrees_}, {self.n_parameters} fitted numbers"
 
     @property
     def n_bands(self) -> int:
@@ -256,8 +275,11 @@ class CompactModel(TransferModel):
         """The nearest model with memory, certified: exponentials for whoever needs a linear differential equation.
 
         Args:
-            order: numbers of exponentials and of pairs.
+            order: numbers of exponentials and of pairs, or the next smaller ones with which a model is never negative.
             span: last time at which the two are compared.
+
+        Raises:
+            CertificateError: if there is none of any order.
         """
         times = torch.cat([
             torch.linspace(0.25, 5, 20, dtype=torch.float64), torch.logspace(math.log10(5.3), math.log10(span), 90, dtype=torch.float64),
@@ -265,8 +287,14 @@ class CompactModel(TransferModel):
         with torch.no_grad():
             mean = self.double()._at(times) if self._rates.dtype != torch.float64 else self._at(times)
             basis = self.basis
-        tensors, _ = fit_memory(times, mean, basis, order)
-        return nonnegative(MemoryModel(rates=self.rates, **tensors), times, mean)
+        order = checked_order(order, len(times))
+        for smaller in (order, *(known for known in ORDERS[::-1] if sum(known) < sum(order))):
+            tensors, _ = fit_memory(times, mean, basis, smaller)
+            try:
+                return nonnegative(MemoryModel(rates=self.rates, **tensors), times, mean)
+            except CertificateError as error:
+                reason = error
+        raise reason
 
     def embedding(self) -> Embedding:
         """That of the nearest model with memory (:meth:`as_memory`): these odds obey no linear equation of their own."""
@@ -671,3 +699,89 @@ def fit_compact_family(
     found, report = solve(problems, mixing, progress=progress)
     family = CompactFamily(scenes[0], lowest, highest, degrees, torch.from_numpy(found), rates)
     return family, report | {"degrees": list(degrees), "strengths": strengths, "sets": sets}
+
+
+@dataclass(frozen=True)
+class CompactSettings:
+    """Settings of the logistic regression.
+
+    Attributes:
+        degrees: in place, distance and time; None for the smallest that reach the ensemble's own error.
+    """
+
+    degrees: tuple[int, int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.degrees is not None:
+            object.__setattr__(self, "degrees", checked_degrees(self.degrees))
+
+
+@dataclass(frozen=True)
+class CompactReport:
+    """Whether the regression ended by itself, its steps, the root mean square misfit in units of the error, and the degrees."""
+
+    converged: bool
+    steps: int
+    misfit: float
+    degrees: tuple[int, int, int]
+
+
+def check_scene(scene: Scene | None) -> None:
+    """Raise for chains that the model is not made for: the waves of its first odds are those of undamped, linear rings."""
+    if scene is None:
+        raise checks.fail("transfer", "be of chains of a scene for model 'compact'", "energies without one")
+    wanted: dict[str, Any] = {"boundary": "periodic", "damping": 0.0}
+    for name, value in wanted.items():
+        if getattr(scene, name) != value:
+            raise checks.fail(name, f"be {value} for model 'compact'", getattr(scene, name))
+    if not scene.disorder.strength > 0:
+        raise checks.fail("disorder.strength", "be above 0 for model 'compact'", scene.disorder.strength)
+    if scene.n_bands < 2 or len(scene.tones) != scene.n_bands:
+        raise checks.fail("n_bands", "be at least 2, with one tone each, for model 'compact'", scene.n_bands)
+
+
+def _fit(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
+    check_scene(sample.scene)
+    assert sample.scene is not None, "checked"
+    rates = torch.einsum("t,str->sr", linear_weights(sample.times, recipe.window), sample.mean)
+    with single_blas_thread():
+        model, told = fit_compact(
+            rates, Waves.of(sample.scene), recipe.settings.degrees, sample.times, sample.mean, sample.long_time,
+            sample.distance, near if isinstance(near, CompactModel) else None, progress,
+        )  # fmt: skip
+    return model, CompactReport(told["converged"], told["steps"], told["misfit"], model.degrees_)
+
+
+def replicas(transfer: BandTransfer, recipe: Recipe, model: CompactModel, repeats: Tensor) -> Iterator[CompactModel]:
+    """Models of ensembles in which the blocks are repeated, (replica, block), by one step from the model each."""
+    sample = Sample.of(transfer)
+    assert sample.scene is not None, "the fit has checked it"
+    problem = regression(
+        Waves.of(sample.scene), model.degrees_, sample.times, sample.mean, sample.long_time, sample.distance
+    )
+    weights, picked = block_weights(transfer, repeats), chosen_times(sample.times)
+    means = torch.einsum("ab,bstr->astr", weights, transfer.block_mean[:, :, picked])
+    if transfer.block_long_time is not None:
+        late = torch.einsum("ab,bsr->asr", weights, transfer.block_long_time)
+        means = torch.cat([means, late[:, :, None]], dim=2)
+    elif sample.long_time is not None:
+        means = torch.cat([means, sample.long_time[:, None].expand(len(means), -1, -1, -1)], dim=2)
+    slope = linear_weights(sample.times, recipe.window)
+    rates = torch.einsum("ab,bsr->asr", weights, torch.einsum("t,bstr->bsr", slope, transfer.block_mean))
+    with single_blas_thread():
+        found = refitted(problem, model, list(means.double().numpy()))
+    for other, slopes in zip(found, rates, strict=True):
+        yield CompactModel(**other.tensors() | {"rates": slopes.clone()})
+
+
+def _rungs(n_times: int) -> list[CompactSettings]:
+    """The degrees that so many times can tell apart, the smallest at least."""
+    return [CompactSettings(degrees) for degrees in LADDER if degrees == LADDER[0] or 2 * degrees[2] <= n_times]
+
+
+COMPACT = ReducedModel(
+    "compact", "odds of damped beats times exponentials of polynomials: a few hundred numbers, never negative", CompactModel,
+    (Fit("logistic", "logistic regression on all times", _fit, settings=CompactSettings, report=CompactReport),),
+    lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="logistic", default=True,
+    needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_scene, named_only=True, windows=(1.0, 5.0), replicas=replicas,
+)  # fmt: skip

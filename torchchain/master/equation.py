@@ -16,6 +16,8 @@ from torchchain.chain.excitation import StandingWave
 from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.scene import Scene, describe
 from torchchain.master import file
+from torchchain.master.certificate import certify
+from torchchain.master.compact import CompactModel
 from torchchain.master.fits import AnalyticReport
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
@@ -114,6 +116,8 @@ class MasterEquation(Printed, nn.Module):
             )
         if bool(self.damping.any()):
             rows["damping"] = f"{float(self.damping.min()):.3g} to {float(self.damping.max()):.3g} per unit time"
+        if self.calibration.report.certificate is not None:
+            rows["energies"] = "never negative, proved for all times"
         rows["conservation defect"] = f"{self.conservation_defect:.1e}"
         return rows | {"rates": self.rates_meaning}
 
@@ -262,28 +266,31 @@ class MasterEquation(Printed, nn.Module):
     def coarsened(self, n_bands: int) -> MasterEquation:
         """The model of fewer and wider bands, each of several of the present ones, for energy spread evenly in a band.
 
-        Exact for a model with memory: its transfer is averaged over the sources and summed over the receivers of a
+        Exact for a model with memory (of a compact one, for the nearest with memory): its transfer is averaged over the sources and summed over the receivers of a
         band. More bands than were calibrated, or rates alone, cannot be had this way.
 
         Raises:
             FieldError: for a number of bands that does not divide the present one, or a model without memory.
         """
-        if not isinstance(self.model, MemoryModel):
+        own = self.model.as_memory() if isinstance(self.model, CompactModel) else self.model
+        if not isinstance(own, MemoryModel):
             raise checks.fail("model", "be 'memory' to be coarsened", repr(self.calibration.model))
         n_bands = checks.integer("n_bands", n_bands, 1, self.n_bands)
         if self.n_bands % n_bands:
             raise checks.fail("n_bands", f"divide the {self.n_bands} bands of the model", n_bands)
         size = self.n_bands // n_bands
         joined = torch.eye(n_bands).to(self.basis).repeat_interleave(size, dim=0)
-        tensors = self.model.tensors()
+        tensors = own.tensors()
         for name in ("rates", "basis", "amplitudes"):
             tensors[name] = joined.T / size @ tensors[name] @ joined
         tensors["damping"] = tensors["damping"] @ joined / size
         record, errors = self.calibration, self.uncertainty
         record = replace(record, scene=_joined_scene(record.scene, n_bands), report=self._joined_report(joined))
-        return MasterEquation(
-            MemoryModel(**tensors), record, None if errors is None else errors.coarsened(joined.to(errors.stderr))
-        )
+        model = MemoryModel(**tensors)
+        if self.calibration.report.certificate is not None:  # sums of what is not negative; proved again all the same
+            proof = certify(model)
+            record = replace(record, report=replace(record.report, certificate=proof if proof.holds else None))
+        return MasterEquation(model, record, None if errors is None else errors.coarsened(joined.to(errors.stderr)))
 
     def _joined_report(self, joined: Tensor) -> Report:
         loss = self.calibration.report.loss

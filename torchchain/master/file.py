@@ -6,10 +6,12 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -17,6 +19,7 @@ from safetensors.torch import save_file
 from torchchain import checks
 from torchchain._version import __version__
 from torchchain.ensemble.scene import Scene
+from torchchain.master.certificate import CertificateError, verify
 from torchchain.master.fits import checked_window
 from torchchain.master.ladder import kinds, methods
 from torchchain.master.model import TransferModel
@@ -32,6 +35,7 @@ CONVENTIONS = {
     "markov": "e(t) = e(0) (basis exp(-damping t) + (1 - basis) exp((rates - damping) t)), row vectors",
     "swing_in": "like markov, but energy moves only after it was released from rest with the rate 1 / delay",
     "memory": "e(t) = e(0) (basis + sum_m amplitudes[m] f_m(t)) exp(-damping t); f: exponentials, then cosine and sine of pairs; rates are slopes at short times, which e(t) does not use",
+    "compact": "shares of a source's energy are the odds of damped beats of two waves, times exponentials of polynomials (coefficients) of place, distance and time, over their sum; see torchchain.master.compact",
     "bands": "n_bands equal bands of |k| in (0, pi]; tone n lies in band ceil(n / (n_particles / 2 / n_bands))",
     "units": "mean mass 1, linear contact stiffness 1; time: travel time of sound over one particle",
 }
@@ -43,6 +47,8 @@ ERROR_AXES = {
 """Of the error bars, which a file holds all or none of."""
 LONGEST_AXIS = 128
 """Functions, or times of the error bars."""
+MOST_TERMS = 2**14
+"""Of polynomials."""
 MOST_MEMBERS = 64
 
 
@@ -81,13 +87,24 @@ def _described(model: TransferModel, record: Calibration) -> dict[str, Any]:
         "window": record.window,
         "scene": None if record.scene is None else record.scene.to_dict(),
         "provenance": record.provenance,
-        "report": record.report.to_dict(),
+        "report": _proved(model, record.report).to_dict(),
         "conventions": CONVENTIONS,
         "versions": {
             "torchchain": __version__,
             **{name: version(name) for name in ("torch", "numpy", "scipy", "torchdiffeq")},
         },
     }
+
+
+def _proved(model: TransferModel, report: Report) -> Report:
+    """The report, without a certificate that the model no longer meets (in single precision, or changed by hand)."""
+    if report.certificate is None:
+        return report
+    try:
+        verify(model, report.certificate)
+    except CertificateError:
+        return replace(report, certificate=None)
+    return report
 
 
 def _packed(model: TransferModel, uncertainty: Uncertainty | None) -> dict[str, torch.Tensor]:
@@ -160,7 +177,10 @@ def _member(where: str, header: dict[str, Any], tensors: dict[str, torch.Tensor]
         report = Report.from_dict(header["report"], None if fit is None else fit.report)
         if report.loss is not None and len(report.loss.rates) != model.n_bands:
             raise checks.fail("report.loss.rates", f"hold {model.n_bands} numbers", report.loss.rates)
-    except (checks.FieldError, checks.FieldTypeError, TypeError) as error:
+        if report.certificate is not None:
+            with np.errstate(all="ignore"):  # of energies that are no numbers nothing is proved
+                verify(model, report.certificate)
+    except (checks.FieldError, checks.FieldTypeError, CertificateError, TypeError) as error:
         raise checks.fail(where, "hold valid fields", f"{error}") from None
     bands = model.n_bands if scene is None else scene.n_bands
     if bands != model.n_bands or header["n_bands"] != model.n_bands:
@@ -252,7 +272,7 @@ def _model_tensors(
         part = file.get_slice(prefix + name)
         shape = tuple(part.get_shape())
         fits = len(shape) == len(axes) and all(
-            size == header["n_bands"] if axis == "band" else size <= LONGEST_AXIS
+            size == header["n_bands"] if axis == "band" else size <= (MOST_TERMS if axis == "term" else LONGEST_AXIS)
             for size, axis in zip(shape, axes, strict=True)
         )
         if not fits:

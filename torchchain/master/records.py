@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.model import TransferModel
 from torchchain.master.sample import Sample
@@ -75,6 +76,9 @@ class ReducedModel:
         needs_strength: whether it needs the strength of the disorder.
         fits_loss: whether it describes the energy lost by damped chains itself; it needs no long-time average then.
         rungs: settings of ``climbed_by`` that selection tries, from the fewest fitted numbers up.
+        check_scene: raises a FieldError for chains, or data without a scene (None), that it cannot describe.
+        named_only: whether selection tries it only where it is named.
+        windows: ends of windows of time; selection takes it only if it reaches the ensemble's error within each.
         replicas: ``replicas(transfer, recipe, model, repeats)`` -> the models of ensembles in which the blocks are
             repeated, (replica, block), where that is quicker than to fit each from its energies.
     """
@@ -92,6 +96,9 @@ class ReducedModel:
     needs_strength: bool = False
     fits_loss: bool = False
     rungs: Callable[[int], Sequence[Any]] = lambda n_times: (NoSettings(),)
+    check_scene: Callable[[Scene | None], None] = lambda scene: None
+    named_only: bool = False
+    windows: tuple[float, ...] = ()
     replicas: Callable[[BandTransfer, Recipe, Any, Tensor], Iterator[TransferModel]] | None = None
 
     def __post_init__(self) -> None:
@@ -107,13 +114,22 @@ class ReducedModel:
         axes = getattr(self.kind, "axes", None)
         if not isinstance(getattr(self.kind, "kind", None), str) or not isinstance(axes, dict):
             raise checks.fail("kind", "be a TransferModel that states its kind and axes", self.kind)
-        if axes.get("basis") != ("band", "band") or axes.get("damping") != ("band",):
+        wanted = {"basis": ("band", "band"), "damping": ("band",)}  # tensors of the file, or what follows from these
+        if any(axes[n] != a if n in axes else not hasattr(self.kind, n) for n, a in wanted.items()):
             raise checks.fail("kind", "have a basis (band, band) and damping (band)", axes)
 
     def fit(self, name: str = "") -> Fit:
         """The fit of a name; of none, the usual one."""
         name = name or self.usual or self.fits[0].name
         return next(fit for fit in self.fits if fit.name == name)
+
+    def describes(self, scene: Scene | None) -> bool:
+        """Whether it can describe the chains of a scene."""
+        try:
+            self.check_scene(scene)
+        except checks.FieldError:
+            return False
+        return True
 
     def suits(self, long_time: bool, strength: bool, damped: bool) -> bool:
         """Whether what it needs is at hand."""
@@ -138,12 +154,13 @@ class Recipe:
 
     @property
     def order(self) -> tuple[int, ...]:
-        """Of a model that comes in several sizes; empty for others."""
-        return tuple(getattr(self.settings, "order", None) or ())
+        """Of a model that comes in several sizes, its order or degrees; empty for others."""
+        return tuple(getattr(self.settings, "order", None) or getattr(self.settings, "degrees", None) or ())
 
     @property
     def complete(self) -> bool:
-        return self.model is not None and getattr(self.settings, "order", 0) is not None
+        sizes = (getattr(self.settings, name, 0) for name in ("order", "degrees"))
+        return self.model is not None and all(size is not None for size in sizes)
 
     def run(self, sample: Sample, near: TransferModel | None = None, progress: Progress = None) -> Fitted:
         """Fit the model to a sample, starting from the model of a similar one if there is one."""

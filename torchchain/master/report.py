@@ -13,6 +13,7 @@ from typing import Any
 
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
+from torchchain.master.proof import ROUNDING, Certificate
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class Report:
         loss: of damped chains.
         horizon: last time at which predictions were compared with chains; infinite where these had settled.
         bootstrap: ensembles drawn again for the error bars.
+        certificate: proof that no energy is ever negative; None where there is none.
         ordered: without disorder nothing moves, and nothing was fitted.
         coarsened_from: number of bands of the model that this one was made of.
         interpolated: strengths of a family and their weights, of which this one is the sum.
@@ -76,12 +78,19 @@ class Report:
     ordered: bool = False
     coarsened_from: int | None = None
     interpolated: tuple[tuple[float, float], ...] = ()
+    certificate: Certificate | None = None
+
+    def __post_init__(self) -> None:
+        if self.certificate is not None and not self.certificate.holds:
+            raise checks.fail("report.certificate.lower", f"be at least {-ROUNDING:g}", self.certificate.lower)
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers, words, lists and tables; an infinite horizon is left out."""
         plain = dataclasses.asdict(self)
         if self.horizon == math.inf:
             del plain["horizon"]
+        if self.certificate is None:
+            del plain["certificate"]
         return plain
 
     @classmethod

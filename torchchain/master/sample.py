@@ -11,6 +11,8 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.energy.wavenumber import basis_fraction
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.report import Loss
 
@@ -28,6 +30,8 @@ class Sample:
         long_time: infinite-time average, [source, receiver], or None.
         strength: disorder xi, or None if unknown.
         damped: whether the chains lose energy.
+        scene: of the chains, or None.
+        distance: expected total variation of two whole ensembles at each time, (time,), or None.
     """
 
     times: Tensor
@@ -35,13 +39,18 @@ class Sample:
     long_time: Tensor | None
     strength: float | None
     damped: bool = False
+    scene: Scene | None = None
+    distance: Tensor | None = None
 
     @classmethod
     def of(cls, transfer: BandTransfer) -> Sample:
         """The whole ensemble."""
         scene = transfer.scene
         strength = None if scene is None else scene.disorder.strength
-        return cls(transfer.times, transfer.mean, transfer.long_time, strength, transfer.damping > 0)
+        found = statistical_distance(transfer.stderr).mean(0)
+        told = bool(found.isfinite().all()) and bool((found > 0).any())
+        damped, distance = transfer.damping > 0, found if told else None
+        return cls(transfer.times, transfer.mean, transfer.long_time, strength, damped, scene, distance)
 
     @classmethod
     def of_blocks(cls, transfer: BandTransfer, repeats: Tensor) -> Sample:

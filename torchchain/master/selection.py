@@ -6,6 +6,7 @@ import warnings
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
@@ -30,6 +31,10 @@ def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
     for record in [asked.model] if asked.model is not None else MODELS.values():
         if record.climbed_by is None or not record.suits(late, known, damped):
             continue
+        if asked.model is not None:
+            record.check_scene(transfer.scene)
+        elif record.named_only or not record.describes(transfer.scene):
+            continue
         fit = record.fit(record.climbed_by)
         for settings in record.rungs(len(transfer.times)):
             size = record.size(transfer.n_bands, damped, settings)
@@ -42,7 +47,7 @@ def select(
 ) -> tuple[Recipe, Selection, TransferModel | None]:
     """The first rung that, fitted on every other block, predicts the rest as well as the fitted blocks' means do.
 
-    As well: within 5 % in total variation. If none does, the nearest. Models with rates are tried with procedure L.
+    As well: within 5 % in total variation, for some models in each of several windows of time. If none does, the nearest. Models with rates are tried with procedure L.
 
     Returns:
         The recipe of the rung, what was tried, and the model fitted to half of the blocks.
@@ -54,24 +59,34 @@ def select(
     even = (torch.arange(blocks) + 1) % 2
     seen, held = Sample.of_blocks(transfer, even), Sample.of_blocks(transfer, 1 - even).mean
     used = transfer.times > 0
-    noise = float(total_variation(seen.mean, held)[:, used].mean())
+    halves = total_variation(seen.mean, held)
+    noise = float(halves[:, used].mean())
     tried: list[Rung] = []
     models: list[TransferModel] = []
+    enough = False
     for candidate in candidates:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FitWarning)
             model, _ = candidate.run(seen, progress=progress)
-        distance = float(total_variation(model.transfer(transfer.times).detach(), held)[:, used].mean())
+        missed = total_variation(model.transfer(transfer.times).detach(), held)
+        distance = float(missed[:, used].mean())
         assert candidate.model is not None, "a rung names its model"
         tried.append(Rung(candidate.model.name, candidate.order, distance))
         models.append(model)
-        if distance <= ENOUGH * noise:
+        enough = all(
+            float(missed[:, window].mean()) <= ENOUGH * float(halves[:, window].mean())
+            for window in _windows(transfer.times, candidate.model.windows)
+        )
+        if enough:
             break
-    best = (
-        len(tried) - 1
-        if tried[-1].distance <= ENOUGH * noise
-        else min(range(len(tried)), key=lambda i: tried[i].distance)
-    )
-    reached = "reaches" if tried[best].distance <= ENOUGH * noise else "comes nearest to"
+    best = len(tried) - 1 if enough else min(range(len(tried)), key=lambda i: tried[i].distance)
+    reached = "reaches" if enough else "comes nearest to"
     reason = f"smallest model that {reached} the distance of the two halves of the ensemble"
     return candidates[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best]
+
+
+def _windows(times: Tensor, ends: tuple[float, ...]) -> list[Tensor]:
+    """Times above 0: all of them, those up to each end, and those after the last; windows without times are left out."""
+    used = times > 0
+    found = [used, *(used & (times <= end) for end in ends), *(times > end for end in ends[-1:])]
+    return [window for window in found if bool(window.any())]

@@ -107,8 +107,9 @@ class Uncertainty:
 
 
 def draw_again(
-    transfer: BandTransfer, recipe: Recipe, model: TransferModel, replicates: int, progress: Progress = None
-) -> Uncertainty:
+    transfer: BandTransfer, recipe: Recipe, model: TransferModel, replicates: int, progress: Progress = None,
+    chosen: TransferModel | None = None,
+) -> Uncertainty:  # fmt: skip
     """Fit the same recipe to ``replicates`` ensembles of blocks drawn with replacement.
 
     Deterministic: the draws depend on the numbers of blocks and replicates alone.
@@ -119,6 +120,7 @@ def draw_again(
         model: fitted to the whole transfer.
         replicates: how many, at least 2.
         progress: called with 1 after every replicate.
+        chosen: the model whose own misfit counts, where that is not ``model`` but one as near to the ensemble.
     """
     blocks = len(transfer.block_counts)
     draws = np.random.Generator(np.random.Philox(key=np.array([blocks, replicates], dtype=np.uint64)))
@@ -135,7 +137,7 @@ def draw_again(
     # blocks drawn with replacement spread (blocks - 1) / blocks of what independent ensembles do
     scale = math.sqrt(blocks / (blocks - 1))
     spread = scale * torch.stack(paths).std(0)
-    missed = (model.transfer(times).detach() - transfer.mean[:, kept]).square()
+    missed = ((chosen or model).transfer(times).detach() - transfer.mean[:, kept]).square()
     noise = (transfer.stderr[:, kept].square() - spread.square()).clamp(min=0)
     own = _smooth(missed - noise).clamp(min=0)
     return Uncertainty(

@@ -1,0 +1,98 @@
+"""The model with memory that calibration hands out: never negative at any time, proved, where such a one is as good."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+
+from torchchain.ensemble.statistics import total_variation
+from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.certificate import CertificateError, certify, nonnegative
+from torchchain.master.fits import FitWarning
+from torchchain.master.memory import ORDERS, MemoryModel, ProjectionReport
+from torchchain.master.model import TransferModel
+from torchchain.master.proof import Certificate
+from torchchain.master.records import Fitted, Progress, Recipe
+from torchchain.master.sample import Sample
+
+AS_GOOD = 1.05
+"""Distance from the ensemble of a model that is never negative, relative to the free fit's, up to which it replaces it."""
+ORDERS_TRIED = 4
+"""Orders whose decay rates are tried, downward from the chosen one: functions that hardly differ only make noise."""
+DIVERGES = 0.1
+"""A model whose energies leave [0, 1] by more than this share at any time is not handed out without a warning."""
+
+
+def certified(
+    transfer: BandTransfer, asked: Recipe, free: Fitted, mend: bool, progress: Progress = None
+) -> tuple[TransferModel, ProjectionReport, Certificate | None]:
+    """The model that is never negative, with its proof, in place of a free fit, where it is as near to the ensemble.
+
+    Args:
+        transfer: of chains without damping.
+        asked: the recipe of the free fit.
+        free: the fit and its report.
+        mend: whether another model may take the place of the free fit; not where its order was asked for.
+        progress: called with 1 after every order.
+
+    Returns:
+        The model, the report of the fit that found its decay rates, and its certificate; the free fit where no other is
+        as good, with a certificate if it has one.
+
+    Warns:
+        FitWarning: if the model that is left diverges, or is farther from the ensemble because the free fit diverged.
+    """
+    model, told = free
+    far = _distance(model, transfer)
+    proof = certify(model)
+    nearest: tuple[float, TransferModel, ProjectionReport, Certificate] | None = None
+    for other, report in _found(transfer, asked, free) if mend else ():
+        off = _distance(other, transfer)
+        if progress is not None:
+            progress(1)
+        if nearest is None or off < nearest[0]:
+            nearest = (off, other, report, certify(other))
+        if off <= AS_GOOD * far:
+            return nearest[1:]
+    if proof.holds:
+        return model, told, proof
+    low, high = min(0.0, float(transfer.mean.min())), max(1.0, float(transfer.mean.max()))  # imported data may be wild
+    if proof.lower < low - DIVERGES or proof.upper > high + DIVERGES:
+        wild = f"the free fit of order {told.order} goes from {proof.lower:.3g} to {proof.upper:.3g} of the energy"
+        if nearest is not None:
+            warnings.warn(
+                f"{wild}: the model of order {nearest[2].order} that is never negative takes its place, "
+                f"{nearest[0]:.3g} from the ensemble in place of {far:.3g}", FitWarning, stacklevel=3,
+            )  # fmt: skip
+            return nearest[1:]
+        warnings.warn(f"{wild}: do not predict other times than it was fitted to", FitWarning, stacklevel=3)
+    return model, told, None
+
+
+def _found(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitted]:
+    """Models that are never negative, with the decay rates of the free fit and of fits of smaller orders."""
+    noise = Sample.of(transfer).distance
+    for model, told in _fits(transfer, asked, free):
+        assert isinstance(model, MemoryModel), "of the method 'projection'"
+        try:
+            yield nonnegative(model, transfer.times, transfer.mean, noise), told
+        except CertificateError:
+            continue
+
+
+def _fits(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitted]:
+    """The free fit, and those of the next smaller orders."""
+    yield free
+    at = ORDERS.index((asked.order[0], asked.order[1]))
+    sample = Sample.of(transfer)
+    for order in ORDERS[max(at - ORDERS_TRIED + 1, 0) : at][::-1]:
+        yield replace(asked, settings=replace(asked.settings, order=order)).run(sample)
+
+
+def _distance(model: TransferModel, transfer: BandTransfer) -> float:
+    used = transfer.times > 0
+    with torch.no_grad():
+        return float(total_variation(model.transfer(transfer.times), transfer.mean)[:, used].mean())
