@@ -81,7 +81,10 @@ def test_renumbering_leaves_the_particles_in_place(monkeypatch):
     before = nw.evolve(network, state, TIMES, "chebyshev")
     monkeypatch.setattr(chebyshev, "RENUMBER", 0)
     assert not np.array_equal(chebyshev.Gathered(network).order, np.arange(network.n_particles))
-    assert far(before, nw.evolve(network, state, TIMES, "chebyshev")) < 1e-11
+    phase = float(network.squared_frequency_bound().max().sqrt() * TIMES[-1])
+    size = float(before.displacement.abs().max() + before.velocity.abs().max())
+    rounding = 20 * phase * torch.finfo(torch.float64).eps * size  # an exact method errs by some w t eps of the state
+    assert far(before, nw.evolve(network, state, TIMES, "chebyshev")) < rounding
 
 
 @pytest.mark.parametrize("lattice", [True, False])
@@ -108,7 +111,7 @@ def test_windows_of_times_and_members_of_a_batch_stand_alone():
     advance = nw.begin(network, state, "chebyshev")
     parts = [advance(TIMES[:4]), advance(TIMES[4:])]
     assert (
-        far(parts[1], tc.Trajectory(TIMES[4:], whole.displacement[..., 4:, :, :], whole.velocity[..., 4:, :, :]))
+        far(parts[1], nw.NetworkTrajectory(TIMES[4:], whole.displacement[..., 4:, :, :], whole.velocity[..., 4:, :, :]))
         < 1e-11
     )
     one = replace(network, masses=network.masses[1], stiffness=network.stiffness[1])
@@ -193,7 +196,7 @@ def test_damped_motion_by_exponentials_and_by_verlet():
     times = torch.tensor([0.0, 0.5, 1.0, 5.0, 300.0], dtype=F64)
     exact = nw.evolve(network, state, times, "damped")
     coarse, fine = (nw.evolve(network, state, times[:4], "verlet", step=h) for h in (0.01, 0.005))
-    exact_part = tc.Trajectory(times[:4], exact.displacement[..., :4, :, :], exact.velocity[..., :4, :, :])
+    exact_part = nw.NetworkTrajectory(times[:4], exact.displacement[..., :4, :, :], exact.velocity[..., :4, :, :])
     assert 3.8 < far(exact_part, coarse) / far(exact_part, fine) < 4.2
     energy = nw.total_energy(network, exact)
     torch.testing.assert_close(energy + exact.dissipated, energy[:, :1].expand_as(energy), rtol=1e-10, atol=1e-10)

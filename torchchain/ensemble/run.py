@@ -197,7 +197,7 @@ class Ensemble:
             "mass_mean": mean,
             "mass_sd": max(0.0, square - mean**2) ** 0.5,
             "method": self.method,
-            "method_options": json.dumps(self.options, default=checks.shown),
+            "method_options": json.dumps(self.options, default=checks.shown, sort_keys=True),
         }
 
 
