@@ -88,7 +88,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 
 def _prediction(config: Config, own: tc.BandTransfer, model: str) -> dict[str, Any]:
     """Seconds of a prediction from one start at 500 times, and its products of matrices in multiplications."""
-    method = "projection" if model == "memory" else "linear"
+    method = {"memory": "projection", "compact": "logistic"}.get(model, "linear")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         master = tc.calibrate(own, method, model, bootstrap=0)
