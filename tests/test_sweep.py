@@ -68,6 +68,8 @@ def test_a_sweep_of_calibrations():
     whole = xarray.load_dataset("s/sweep.nc", engine="h5netcdf")
     assert whole["band_energy"].sizes["disorder.strength"] == 2
     assert not [name for name in whole.data_vars if name.startswith("block")]
+    assert (whole["run_n_parameters"] == 16).all()
+    assert (whole["run_tv"] > 0).all()
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,10 @@ def _leave(
         "figure.png": outputs.figure(figure),
     }
     config = run.config(*scene, tomli_w.dumps({"calibration": chosen}))
-    run.write(files, config, seed=seed, **source, forecast=forecast, summary=dict(rows))
+    run.write(
+        files, config, seed=seed, **source, forecast=forecast, summary=dict(rows),
+        numbers=numbers(transfer, master, predicted),
+    )  # fmt: skip
     print(title(transfer))
     run.told(forecast)
     for warning in caught:
@@ -154,6 +157,27 @@ def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.
         realized = "{mass_mean:.5f}, {mass_sd:.5f}".format(**transfer.attributes)
         rows.append(("masses: realized mean, standard deviation", realized))
     return rows
+
+
+def numbers(transfer: BandTransfer, master: MasterEquation, predicted: torch.Tensor) -> dict[str, float]:
+    """What sums a calibration up, as numbers with short names, for tables and sweeps.
+
+    Returns:
+        n_parameters; lowest_energy predicted, of the start's; tv, mean total variation from the ensemble over t > 0, and tv_noise,
+        that of two such ensembles; horizon, the last time compared with chains; conservation_defect of undamped chains.
+    """
+    later = transfer.times > 0
+    found = {
+        "n_parameters": float(master.n_parameters),
+        "lowest_energy": float(predicted.min()),
+        "horizon": master.horizon,
+    }
+    if bool(later.any()):
+        found["tv"] = float(total_variation(predicted, transfer.mean)[:, later].mean())
+        found["tv_noise"] = float(statistical_distance(transfer.stderr)[:, later].mean())
+    if transfer.damping == 0:
+        found["conservation_defect"] = master.model.conservation_defect
+    return found
 
 
 def calibration_figure(transfer: BandTransfer, master: MasterEquation, predicted: torch.Tensor) -> Any:

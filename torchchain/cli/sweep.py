@@ -167,7 +167,7 @@ def _done(folder: Path, text: str) -> bool:
 def _row(record: Mapping[str, Any]) -> dict[str, float]:
     """The numbers that sum a run up."""
     found: dict[str, float] = {}
-    for part in ({"seconds": record.get("seconds")}, record.get("realized") or {}, record.get("summary") or {}):
+    for part in ({"seconds": record.get("seconds")}, record.get("realized") or {}, record.get("numbers") or {}):
         found |= {k: float(v) for k, v in part.items() if isinstance(v, (int, float)) and not isinstance(v, bool)}
     return found
 
