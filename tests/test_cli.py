@@ -356,8 +356,8 @@ def test_nan_devices_and_empty_words(run):
 
 
 CALIBRATE_FLAGS = [
-    ("--fit magic", "method must be one of analytic, linear, nonlinear, adam, projection, got 'magic'"),
-    ("--model magic", "model must be one of paper, exact_psi, basis_matrix, swing_in, memory, got 'magic'"),
+    ("--fit magic", "method must be one of analytic, linear, nonlinear, adam, projection, logistic, got 'magic'"),
+    ("--model magic", "model must be one of paper, exact_psi, basis_matrix, swing_in, memory, compact, got 'magic'"),
     (
         "--fit linear --model memory",
         "model must be one of paper, exact_psi, basis_matrix, swing_in for method 'linear'",
