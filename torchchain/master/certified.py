@@ -75,7 +75,7 @@ def certified(
 def _found(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitted]:
     """Models that are never negative, with the decay rates of the free fit and of fits of smaller orders."""
     noise = Sample.of(transfer).distance
-    if not bool((noise > 0).any()):  # a single band keeps all its energy: nothing to weigh, and nothing to mend
+    if transfer.n_bands == 1:  # it keeps all its energy: nothing decays that could be mended
         return
     for model, told in _fits(transfer, asked, free):
         assert isinstance(model, MemoryModel), "of the method 'projection'"
