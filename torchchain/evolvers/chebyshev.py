@@ -104,7 +104,7 @@ def highest_frequency(chain: Chain, bound: float | Tensor | None = None) -> Tens
         )
         if checks.is_transformed(squared):  # one bound for all that vmap runs at once
             squared = checks.traced_values(squared).amax().expand(chain.batch_shape)
-        return torch.as_tensor(_rounded_up(_numbers(squared.sqrt())), device=squared.device)
+        return torch.as_tensor(rounded_up(_numbers(squared.sqrt())), device=squared.device)
 
 
 def _numbers(values: Tensor) -> np.ndarray:
@@ -112,7 +112,7 @@ def _numbers(values: Tensor) -> np.ndarray:
     return np.array(checks.traced_values(values).tolist(), np.float64)
 
 
-def _rounded_up(frequency: np.ndarray) -> np.ndarray:
+def rounded_up(frequency: np.ndarray) -> np.ndarray:
     """Rounded up to 24 bits: W^2 and most W t are exact then, and the operator and its time fit to the last bit."""
     mantissa, exponent = np.frexp(frequency)
     return np.ldexp(np.ceil(mantissa * 2**24) / 2**24, exponent)
@@ -194,7 +194,7 @@ def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> A
         check_work(times, frequencies.max())
         phase.check(times, frequency, pair.dtype)
         outputs = []
-        for t in _later(times, now).tolist():
+        for t in later_times(times, now).tolist():
             # Each realization takes the leaps it needs by itself, and then rests.
             leaps = np.ceil(frequencies * (t - now) / LEAP)
             for leap in range(int(leaps.max())):
@@ -207,7 +207,7 @@ def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> A
     return advance
 
 
-def _later(times: Tensor, now: float) -> Tensor:
+def later_times(times: Tensor, now: float) -> Tensor:
     """The times as float64 on the CPU, none before those of the last window."""
     if bool(times[0] < now):
         raise checks.fail("times", f"not go back behind the last window's end {now:g}", times[0].item())
@@ -240,7 +240,7 @@ class CompiledAdvance:
             masses=masses,
             contacts=springs,
             rigid_masses=plain(chain.rigid_mass[..., None])[:, 0],
-            frequencies=_rounded_up(np.sqrt(squared)),
+            frequencies=rounded_up(np.sqrt(squared)),
             states=states.double().reshape(-1, 2, n).numpy(),
             starts=math.prod(state.displacement.shape[:-1]) // len(masses),
             periodic=periodic,
@@ -263,7 +263,7 @@ class CompiledAdvance:
         from torchchain.evolvers import stencil
 
         self.check_work(times)
-        later = _later(times, self._now)
+        later = later_times(times, self._now)
         out = torch.empty((2, self.rows.count, len(later), self._n), dtype=self._dtype)
         steps, states = later.numpy(), out.numpy()
         stencil.share(lambda begin, end: self._march.fields(begin, end, steps, stencil.STATES, states), self.rows.count)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import State
-from torchchain.evolvers.chebyshev import check_work
+from torchchain.evolvers.chebyshev import check_work, later_times, rounded_up
 from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS
 from torchchain.evolvers.method import Advance, Method
 from torchchain.modes import phase
@@ -98,15 +98,7 @@ def highest_frequency(network: Network, bound: float | Tensor | None = None) -> 
             rule = "not lie below the largest squared frequency (network.squared_frequency_bound() never does)"
             checks.first_bad("bound", rule, squared, exceeded, "network")
         frequency = squared.clamp(min=1e-300).sqrt().cpu().numpy()  # no bonds: any W will do
-        mantissa, exponent = np.frexp(frequency)  # rounded up to 24 bits, so that W^2 is exact
-        return torch.as_tensor(np.ldexp(np.ceil(mantissa * 2**24) / 2**24, exponent), device=squared.device)
-
-
-def _later(times: Tensor, now: float) -> list[float]:
-    """The times as numbers, none before those of the last window."""
-    if bool(times[0] < now):
-        raise checks.fail("times", f"not go back behind the last window's end {now:g}", times[0].item())
-    return times.detach().to("cpu", torch.float64).tolist()
+        return torch.as_tensor(rounded_up(frequency), device=squared.device)
 
 
 def _plain(network: Network, state: State, frequency: Tensor, tolerance: float) -> Advance:
@@ -139,7 +131,7 @@ def _plain(network: Network, state: State, frequency: Tensor, tolerance: float) 
         check_work(times, frequencies.max())
         phase.check(times, frequency, pair.dtype)
         outputs = []
-        for t in _later(times, now):
+        for t in later_times(times, now).tolist():
             leaps = np.ceil(frequencies * (t - now) / LEAP)
             for leap in range(int(leaps.max())):
                 pair = step(pair, np.where(leap < leaps, (t - now) / np.maximum(leaps, 1), 0.0))
@@ -383,7 +375,7 @@ class CompiledAdvance:
     def __call__(self, times: Tensor) -> NetworkTrajectory:
         check_work(times, float(self.frequencies.max()))
         phase.check(times, torch.from_numpy(self.frequencies), torch.float64)
-        later = _later(times, self._now)
+        later = later_times(times, self._now).tolist()
         rows = len(self._anchors)
         n, c = self._shape[-2:]
         out = torch.empty((2, rows, len(later), n, c), dtype=self._dtype)
