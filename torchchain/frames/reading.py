@@ -43,13 +43,15 @@ def read_frames(
         path: a file, plain or gzip; a pattern such as "post/dump*.liggghts"; or a list of files, whose frames follow each other.
         contacts: the same for contact lists (LAMMPS and LIGGGHTS dump local, MercuryDPM .fstat), matched by time step or time.
         format: a name in ``torchchain.frames.FORMATS``; by default what the file begins with.
-        options:
-            time_step: time between two step numbers, for dumps without ITEM: TIME.
-            masses: where the file has none: a number, one for each id in ascending order, a dict from type to mass, or a
-                MercuryDPM .restart file.
-            density: masses from the radii: of spheres, or of disks where the file has two dimensions.
-            contact_columns: which columns of a contact list are which; see ``FORMATS[...].options``.
-            periodic: axes such as "x" or "xy" on which the box is periodic, where the file does not say.
+        options: as named below.
+
+    Keyword Args:
+        time_step: time between two step numbers, for dumps without ITEM: TIME.
+        masses: where the file has none: a number, one for each id in ascending order, a dict from type to mass, or a
+            MercuryDPM .restart file.
+        density: masses from the radii: of spheres, or of disks where the file has two dimensions.
+        contact_columns: which columns of a contact list are which; see ``FORMATS[...].options``.
+        periodic: axes such as "x" or "xy" on which the box is periodic, where the file does not say.
 
     Returns:
         Frames, at least one.
