@@ -148,7 +148,10 @@ def dataset(data: xarray.Dataset) -> Writer:
 
     def writer(path: Path) -> None:
         _require_room(path, data.nbytes)
-        encoding = {name: COMPRESSION for name, values in data.data_vars.items() if values.ndim and values.dtype.kind in "fiu"}  # fmt: skip
+        numbers = {
+            name: values for name, values in data.data_vars.items() if values.ndim and values.dtype.kind in "fiu"
+        }
+        encoding = {name: {**COMPRESSION, **values.encoding} for name, values in numbers.items()}
         data.to_netcdf(path, engine="h5netcdf", encoding=encoding)
 
     return writer

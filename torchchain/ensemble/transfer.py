@@ -23,6 +23,7 @@ from torchchain.chain.excitation import StandingWave
 from torchchain.chain.states import Trajectory
 from torchchain.energy.bands import band_of
 from torchchain.ensemble import plan as planning
+from torchchain.ensemble.block_means import decoded, encoded, rounded
 from torchchain.ensemble.checkpoint import Checkpoint
 from torchchain.ensemble.imported import gathered
 from torchchain.ensemble.labels import ordered_error, scene_attributes, time_coordinates
@@ -73,7 +74,9 @@ class BandTransfer(Printed):
         times: (time,).
         mean, stderr: share of the energy, [source, time, receiver].
         long_time, long_time_stderr: infinite-time average, [source, receiver]; None if not known.
-        block_mean: means over consecutive blocks of realizations, [block, source, time, receiver].
+        block_mean: means over consecutive blocks of realizations, [block, source, time, receiver]. Of large transfers (a
+            million numbers and more) they and ``stderr`` are rounded to what their noise tells, well below it, with all
+            sums kept (see :mod:`torchchain.ensemble.block_means`); the mean is exact.
         block_long_time: [block, source, receiver], or None.
         block_counts: realizations (of opposite ones, pairs) in each block.
         attributes: of a simulation the realized mean and standard deviation of the masses, ``mass_mean`` and
@@ -175,7 +178,12 @@ class BandTransfer(Printed):
 
         put("band_energy", (s, t, r), self.mean, "share of the energy in the receiving band")
         put("band_energy_stderr", (s, t, r), self.stderr, "its standard error")
-        put("block_band_energy", (b, s, t, r), self.block_mean, "block means")
+        whole = encoded(self.block_mean, self.mean, self.stderr, self.block_counts)
+        if whole is None:
+            put("block_band_energy", (b, s, t, r), self.block_mean, "block means")
+        else:
+            label = {"units": "1", "long_name": "block means as integers, which BandTransfer.load understands"}
+            variables["block_steps"] = ((b, s, t, r), whole, label, {"zlib": True, "complevel": 4})
         put("block_count", (b,), torch.tensor(self.block_counts), "realizations in a block")
         if self.long_time is not None and self.long_time_stderr is not None and self.block_long_time is not None:
             put("long_time", (s, r), self.long_time, "infinite-time average of the share")
@@ -206,7 +214,8 @@ class BandTransfer(Printed):
             FieldError, FieldTypeError: for a dataset that is not of a band transfer.
         """
         checks.instance("data", data, xarray.Dataset)
-        needed = ("band_energy", "band_energy_stderr", "block_band_energy", "block_count")
+        whole = "block_steps" in data
+        needed = ("band_energy", "band_energy_stderr", "block_steps" if whole else "block_band_energy", "block_count")
         late = ("long_time", "long_time_stderr", "block_long_time") if "long_time" in data else ()
         for name in (*needed, *late):
             if name not in data:
@@ -230,16 +239,18 @@ class BandTransfer(Printed):
             return torch.from_numpy(values)
 
         held = "long_time" in data
+        mean, stderr = tensor("band_energy"), tensor("band_energy_stderr")
+        counts = tuple(checks.integer("data.block_count", n, 1) for n in np.atleast_1d(data["block_count"].values))
         return cls(
             scene,
             tensor("time") if scene is None else scene.times,
-            tensor("band_energy"),
-            tensor("band_energy_stderr"),
+            mean,
+            stderr,
             tensor("long_time") if held else None,
             tensor("long_time_stderr") if held else None,
-            tensor("block_band_energy"),
+            _decoded(data, mean, stderr, counts) if whole else tensor("block_band_energy"),
             tensor("block_long_time") if held else None,
-            tuple(checks.integer("data.block_count", n, 1) for n in np.atleast_1d(data["block_count"].values)),
+            counts,
             attributes,
             _provenance_of(data),
             tensor("systematic") if "systematic" in data else None,
@@ -407,6 +418,17 @@ class BandTransfer(Printed):
         return replace(made, attributes={**made.attributes, **attributes})
 
 
+def _decoded(data: xarray.Dataset, mean: Tensor, stderr: Tensor, counts: tuple[int, ...]) -> Tensor:
+    """The block means of a file that holds them as whole steps."""
+    missed = data["block_steps"].values
+    if missed.dtype.kind != "i":
+        raise checks.FieldTypeError(f"data.block_steps must be of integers, got {missed.dtype}")
+    expected = (len(counts), *mean.shape)
+    if mean.ndim != 3 or missed.shape != expected or stderr.shape != mean.shape:
+        raise checks.fail("data.block_steps", f"have shape {expected}", f"shape {missed.shape}")
+    return decoded(missed, mean.double(), stderr.double(), counts)
+
+
 def _imported(provenance: str | Provenance, times: Tensor, energies: Tensor) -> Provenance:
     """Where the data come from, with the hash of the numbers."""
     if not isinstance(provenance, Provenance):
@@ -450,8 +472,10 @@ def _fitted(
     if late is None:
         unsettled = (found.mean[:, count + 2] - found.mean[:, count + 1]) / 2
         error = (error.square() + unsettled.square()).sqrt()
+    mean = found.mean[:, :count].contiguous()
+    block_mean, stderr = rounded(found.block_mean[:, :, :count], mean, found.stderr[:, :count], found.block_counts)
     return BandTransfer(
-        None, times, found.mean[:, :count], found.stderr[:, :count], average, error, found.block_mean[:, :, :count],
+        None, times, mean, stderr, average, error, block_mean,
         blocks, found.block_counts, {"start_condition": found.condition}, provenance,
     )  # fmt: skip
 
@@ -575,16 +599,19 @@ def _from_moments(
     total = merged(blocks)
     ends = moments.blocks("long_time_band_energy") if "long_time_band_energy" in moments.names else []
     end: Moments | None = merged(ends) if ends else None
+    counts = tuple(block.count for block in blocks)
+    stacked = torch.stack([block.mean for block in blocks])
+    block_mean, stderr = rounded(stacked, total.mean, ordered_error(is_ordered, total), counts)
     return BandTransfer(
         scene,
         times,
         total.mean,
-        ordered_error(is_ordered, total),
+        stderr,
         end.mean if end else None,
         ordered_error(is_ordered, end) if end else None,
-        torch.stack([block.mean for block in blocks]),
+        block_mean,
         torch.stack([block.mean for block in ends]) if ends else None,
-        tuple(block.count for block in blocks),
+        counts,
         attributes,
         provenance,
     )
