@@ -15,11 +15,27 @@ from torchchain.spelling import suggestion
 
 
 class FieldError(ValueError):
-    """A value that breaks a rule: the message reads ``field must rule, got value``."""
+    """A value that breaks a rule: the message reads ``field must rule, got value``.
+
+    Example:
+        >>> try:
+        ...     tc.Disorder(strength=-0.1)
+        ... except tc.FieldError as error:
+        ...     print(error)
+        disorder.strength must be at least 0, got -0.1
+    """
 
 
 class FieldTypeError(TypeError):
-    """A value of the wrong type, worded like :class:`FieldError`."""
+    """A value of the wrong type, worded like :class:`FieldError`.
+
+    Example:
+        >>> try:
+        ...     tc.Disorder(strength="weak")
+        ... except tc.FieldTypeError as error:
+        ...     print(error)
+        disorder.strength must be a number, got 'weak'
+    """
 
 
 def shown(value: Any, width: int = 80) -> str:

@@ -10,7 +10,16 @@ from torch import Tensor
 
 
 class IntegrationError(RuntimeError):
-    """A solver could not reach the end of the time span."""
+    """A solver could not reach the end of the time span.
+
+    Example:
+        >>> growing = tc.RateModel(torch.diag(torch.tensor([10.0, 10.0], dtype=torch.float64)), torch.zeros(2, dtype=torch.float64))
+        >>> try:
+        ...     _ = tc.MasterEquation(growing, None).solve(torch.ones(2, dtype=torch.float64), [0.0, 500.0])
+        ... except tc.IntegrationError as error:
+        ...     print(error)
+        solver 'expm' must stay finite, got overflow up to time 500
+    """
 
 
 @dataclass(frozen=True)

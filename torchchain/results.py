@@ -39,6 +39,17 @@ class RunFolder:
 
     Raises:
         FieldError: naming the folder and what it does not hold, or holds in a changed form.
+
+    Example:
+        >>> import contextlib, io, tempfile
+        >>> from torchchain.cli import main
+        >>> out = tempfile.mkdtemp()
+        >>> words = ["simulate", "--n-particles", "16", "--n-bands", "2", "--realizations", "2", "--times.stop", "1", "--out", out]
+        >>> with contextlib.redirect_stdout(io.StringIO()):
+        ...     status = main(words)  # as the command torchchain does
+        >>> run = tc.open(out)
+        >>> run.scene.n_particles, list(run.data.band_energy.dims)
+        (16, ['tone', 'time', 'band'])
     """
 
     path: Path

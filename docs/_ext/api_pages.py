@@ -7,8 +7,6 @@ import inspect
 from pathlib import Path
 from typing import Any
 
-from pages import plain
-
 TOPICS: dict[str, tuple[str, str]] = {
     "chains": (
         "Chains, disorder, starts",
@@ -106,6 +104,8 @@ def write_reference(target: Path) -> None:
 
 def _constant(value: Any) -> str:
     """A registry by its keys with their summaries, anything else as it is."""
+    from pages import plain  # which needs docutils; the tests read TOPICS without it
+
     if isinstance(value, dict):
         words = {key: getattr(record, "summary", "") or getattr(record, "label", "") for key, record in value.items()}
         return "; ".join(f"``{key}``: {plain(said)}" if said else f"``{key}``" for key, said in words.items()) + "."

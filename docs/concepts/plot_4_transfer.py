@@ -11,7 +11,14 @@ import matplotlib.pyplot as plt
 
 import torchchain as tc
 
-scene = tc.Scene(n_particles=128, n_bands=16, disorder=tc.Disorder(strength=0.3), realizations=50, times=[0.0, 1.0, 4.0, 16.0], seed=0)
+scene = tc.Scene(
+    n_particles=128,
+    n_bands=16,
+    disorder=tc.Disorder(strength=0.3),
+    realizations=50,
+    times=[0.0, 1.0, 4.0, 16.0],
+    seed=0,
+)
 transfer = tc.band_transfer(scene, method="modes")
 print(transfer.mean.shape, transfer.long_time.shape)  # [source, time, receiver], [source, receiver]
 

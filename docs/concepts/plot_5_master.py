@@ -20,7 +20,9 @@ best = tc.calibrate(transfer)  # picks a model by its error on chains that it wa
 
 figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
 limit = float(paper.rates.detach().abs().max())
-image = axes[0].imshow(paper.rates.detach(), origin="lower", extent=(0.5, 16.5, 0.5, 16.5), cmap="RdBu_r", vmin=-limit, vmax=limit)
+image = axes[0].imshow(
+    paper.rates.detach(), origin="lower", extent=(0.5, 16.5, 0.5, 16.5), cmap="RdBu_r", vmin=-limit, vmax=limit
+)
 axes[0].set(xlabel="to band r", ylabel="from band s", title="rates Q[s, r]")
 figure.colorbar(image)
 start = torch.zeros(16, dtype=torch.float64)

@@ -21,7 +21,9 @@ test = [tc.chapman_kolmogorov(transfer, lag=lag, multiples=(2,)) for lag in (1.0
 
 figure, axis = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
 axis.loglog([t.lag for t in test], [t.distance.mean() for t in test], "o-", label="T(2t) and T(t)$^2$")
-axis.loglog([t.lag for t in test], [t.statistical.mean() for t in test], "s--", label="by chance, for a chain without memory")
+axis.loglog(
+    [t.lag for t in test], [t.statistical.mean() for t in test], "s--", label="by chance, for a chain without memory"
+)
 axis.set(xlabel="time t", ylabel="mean total variation")
 axis.legend(fontsize="small")
 plt.show()

@@ -16,7 +16,8 @@ sizes, measured, predicted = (10, 20, 40, 80, 160), [], []
 for size in sizes:
     pair = [
         tc.band_transfer(
-            tc.Scene(n_particles=64, n_bands=8, realizations=size, seed=seed, times=[0.0, 10.0, 20.0, 40.0]), method="modes"
+            tc.Scene(n_particles=64, n_bands=8, realizations=size, seed=seed, times=[0.0, 10.0, 20.0, 40.0]),
+            method="modes",
         )
         for seed in (1, 2)
     ]

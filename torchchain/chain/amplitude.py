@@ -17,7 +17,17 @@ DEVIATION_WHERE_OPEN = 1 / 3
 
 
 class LinearityWarning(UserWarning):
-    """Linear contacts asked for amplitudes at which real ones are markedly nonlinear, or open."""
+    """Linear contacts asked for amplitudes at which real ones are markedly nonlinear, or open.
+
+    Example:
+        >>> import warnings
+        >>> scene = tc.Scene(n_particles=16, n_bands=4, excitation=tc.StandingWave(tones=(4,), amplitude=0.3), realizations=2, times=[1.0])
+        >>> with warnings.catch_warnings(record=True) as told:
+        ...     warnings.simplefilter("always")
+        ...     _ = tc.simulate(scene, method="modes")
+        >>> any(issubclass(warning.category, tc.LinearityWarning) for warning in told)
+        True
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +39,11 @@ class Linearity:
         stretch: the largest lengthening; a contact opens at 1. Same axes.
         force_deviation: the largest |F / F_linear - 1| of the Hertz contact (Eq. 9) at those elongations, about
             elongation / 4. Same axes.
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(16))
+        >>> tc.linearity(chain, tc.standing_wave(chain, tone=1, amplitude=0.01)).elongation.item() < 0.01
+        True
     """
 
     elongation: Tensor
@@ -45,6 +60,12 @@ def linearity(chain: Chain, states: State | Trajectory) -> Linearity:
 
     Returns:
         Linearity, one value per state.
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(16))
+        >>> found = tc.linearity(chain, tc.standing_wave(chain, tone=8, amplitude=0.1, phase="cos"))
+        >>> round(found.elongation.item(), 3), round(found.force_deviation.item(), 3)
+        (0.2, 0.052)
     """
     checks.instance("chain", chain, Chain)
     checks.instance("states", states, State, Trajectory)

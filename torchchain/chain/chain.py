@@ -35,6 +35,12 @@ class Chain:
 
     Raises:
         FieldError, FieldTypeError: for a value out of range, naming its realization and particle.
+
+    Example:
+        >>> masses = tc.Disorder(strength=0.3).masses(n_particles=8, realizations=2, seed=0)
+        >>> chain = tc.Chain(masses, boundary="fixed")
+        >>> chain.n_contacts, tuple(chain.masses.shape)
+        (9, (2, 8))
     """
 
     masses: Tensor

@@ -26,6 +26,11 @@ def impulse(chain: Chain, site: int = 1, velocity: float = 0.01) -> State:
 
     Returns:
         State (*batch, particle).
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(4))
+        >>> tc.impulse(chain, site=2, velocity=0.01).velocity.tolist()
+        [0.0, 0.009999999776482582, 0.0, 0.0]
     """
     checks.instance("chain", chain, Chain)
     site = checks.integer("site", site, 1, chain.n_particles)
@@ -46,6 +51,13 @@ def standing_wave(chain: Chain, tone: int | Sequence[int] = 1, amplitude: float 
 
     Returns:
         State (*batch, particle), or (*batch, tone, particle) for a sequence.
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(8, dtype=torch.float64))
+        >>> tc.standing_wave(chain, tone=2, amplitude=0.01).displacement.round(decimals=4).tolist()
+        [0.01, 0.0, -0.01, 0.0, 0.01, 0.0, -0.01, 0.0]
+        >>> tuple(tc.standing_wave(chain, tone=[1, 2, 3]).displacement.shape)
+        (3, 8)
     """
     shared = _shared_wave(chain, tone, amplitude, phase)
     return State(shared.displacement.clone(), shared.velocity.clone())
@@ -94,7 +106,18 @@ def _size(field: str, value: float) -> float:
 
 @dataclass(frozen=True)
 class Impulse:
-    """What a scene says of an impulse; see :func:`impulse`."""
+    """What a scene says of an impulse; see :func:`impulse`.
+
+    Attributes:
+        site: the particle, counted from 1.
+        velocity: in sound speeds of the ordered chain times the initial overlap.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, boundary="fixed", excitation=tc.Impulse(site=1), observables=("center",),
+        ...                  times=[0.0, 20.0], realizations=4)
+        >>> tc.simulate(scene, method="modes").center.dims
+        ('time',)
+    """
 
     site: int = 1
     velocity: float = 0.01
@@ -115,6 +138,16 @@ class StandingWave:
     """What a scene says of standing waves; see :func:`standing_wave`. Each tone is a wave of its own.
 
     ``tones=None`` is the center tone of every band, (s - 1/2) N / (2 B) rounded up: 2, 6, ..., 126 for N = 256, B = 32.
+
+    Attributes:
+        tones: each 1 to N / 2, counted from 1; None for the center tone of every band.
+        amplitude: in initial overlaps.
+        phase: "sin" or "cos".
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, excitation=tc.StandingWave(tones=(3, 5)), realizations=4, times=[0.0, 9.0])
+        >>> dict(tc.simulate(scene, method="modes").band_energy.sizes)
+        {'tone': 2, 'time': 2, 'band': 8}
     """
 
     tones: tuple[int, ...] | None = None

@@ -26,6 +26,11 @@ class Scaling:
         young_modulus: Pa.
         poisson_ratio: 0 to 0.5.
         force: precompression, N.
+
+    Example:
+        >>> beads = tc.Scaling(radius=5e-3, density=7850.0, young_modulus=2e11, poisson_ratio=0.3, force=10.0)
+        >>> f"{beads.sound_speed:.0f} m/s, overlap {beads.overlap:.1e} m, unit of time {beads.unit('time'):.1e} s"
+        '545 m/s, overlap 1.2e-06 m, unit of time 1.8e-05 s'
     """
 
     radius: float

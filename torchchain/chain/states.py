@@ -13,7 +13,17 @@ from torchchain import checks
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Displacement and velocity of every particle at one instant, each (*batch, *any, particle)."""
+    """Displacement and velocity of every particle at one instant, each (*batch, *any, particle).
+
+    Attributes:
+        displacement: in initial overlaps.
+        velocity: in initial overlaps per travel time of sound over one particle.
+
+    Example:
+        >>> state = tc.State(displacement=torch.zeros(5), velocity=torch.ones(5))
+        >>> tuple(state.velocity.shape)
+        (5,)
+    """
 
     displacement: Tensor
     velocity: Tensor
@@ -44,6 +54,12 @@ class Trajectory:
         displacement, velocity: (*batch, *any, time, particle).
         dissipated: energy lost to contact damping since time 0, (*batch, *any, time); None if undamped.
         openings: contacts open at any step up to each time, (*batch, *any, time); None for linear contacts.
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(16))
+        >>> path = tc.evolve(chain, tc.impulse(chain, site=3), [0.0, 1.0, 2.0], method="modes")
+        >>> tuple(path.displacement.shape), path.dissipated is None
+        ((3, 16), True)
     """
 
     times: Tensor

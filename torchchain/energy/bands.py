@@ -10,7 +10,15 @@ from torchchain import checks
 
 
 def check_bands(n_particles: int, n_bands: int) -> int:
-    """The number of tones per band; an error unless the N/2 tones divide evenly into the bands."""
+    """The number of tones per band; an error unless the N/2 tones divide evenly into the bands.
+
+    Raises:
+        FieldError: saying which numbers of bands would do.
+
+    Example:
+        >>> tc.energy.check_bands(256, 32)
+        4
+    """
     n_bands = checks.integer("n_bands", n_bands, 1)
     if n_particles % 2:
         raise checks.fail("n_particles", "be even for wavenumber bands", n_particles)
@@ -27,13 +35,28 @@ def check_bands(n_particles: int, n_bands: int) -> int:
 
 
 def center_tones(n_particles: int, n_bands: int) -> tuple[int, ...]:
-    """The center tone of every band, (s - 1/2) N / (2 B) rounded up to an integer."""
+    """The center tone of every band, (s - 1/2) N / (2 B) rounded up to an integer.
+
+    Example:
+        >>> tc.energy.center_tones(256, 32)[:3]
+        (2, 6, 10)
+    """
     width = n_particles // (2 * n_bands)
     return tuple(math.ceil((2 * band - 1) * width / 2) for band in range(1, n_bands + 1))
 
 
 def band_of(tone: int, n_particles: int, n_bands: int) -> int:
-    """The band, counted from 1, that holds a tone: ceil(tone / (N / 2 / B))."""
+    """The band, counted from 1, that holds a tone: ceil(tone / (N / 2 / B)).
+
+    Args:
+        tone: counted from 1.
+        n_particles: N, even.
+        n_bands: B, a divisor of N/2.
+
+    Example:
+        >>> tc.energy.band_of(90, n_particles=256, n_bands=32)
+        23
+    """
     return -(-tone // check_bands(n_particles, n_bands))
 
 
@@ -46,6 +69,10 @@ def bin_energy(energy: Tensor, n_bands: int) -> Tensor:
 
     Returns:
         (*batch, band).
+
+    Example:
+        >>> tc.bin_energy(torch.tensor([9.0, 1.0, 2.0, 3.0, 4.0]), n_bands=2).tolist()
+        [3.0, 7.0]
     """
     energy = checks.real_tensor("energy", energy)
     if energy.ndim == 0:

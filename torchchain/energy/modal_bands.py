@@ -36,6 +36,13 @@ def modal_band_energy(
 
     Returns:
         (*batch, *any, time, band).
+
+    Example:
+        >>> chain = tc.Chain(tc.Disorder().masses(64, 2, 0))
+        >>> state = tc.standing_wave(chain, tone=22)
+        >>> quick = tc.energy.modal_band_energy(chain, state, [0.0, 50.0], n_bands=8)
+        >>> torch.allclose(quick, tc.band_energy(chain, tc.evolve(chain, state, [0.0, 50.0], method="modes"), n_bands=8))
+        True
     """
     width = check_bands(chain.n_particles, n_bands)
     require_linear(chain, "particle_energy, which is defined for every contact law")

@@ -26,7 +26,18 @@ def checked(chain: Chain, trajectory: Trajectory) -> None:
 
 
 def kinetic_energy(chain: Chain, trajectory: Trajectory) -> Tensor:
-    """Kinetic energy of every particle (Eq. 30), (*batch, time, particle)."""
+    """Kinetic energy of every particle (Eq. 30), (*batch, time, particle).
+
+    Args:
+        chain: masses (*batch, particle).
+        trajectory: velocity (*batch, time, particle).
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(4, dtype=torch.float64))
+        >>> path = tc.evolve(chain, tc.impulse(chain, velocity=0.5), [0.0], method="modes")
+        >>> tc.kinetic_energy(chain, path).round(decimals=6).tolist()
+        [[0.125, 0.0, 0.0, 0.0]]
+    """
     checked(chain, trajectory)
     velocity = trajectory.velocity
     return checks.finite(
@@ -44,6 +55,12 @@ def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "si
             from where its rigid motion has taken it, as the particle energies would otherwise grow with that. "bond" is
             half of the energy of both contacts (Eq. A3), never negative, and counts the whole of a wall contact for
             its one particle. Both have the same sum for linear contacts. Hertz contacts have only "bond".
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(4, dtype=torch.float64), boundary="fixed")
+        >>> path = tc.Trajectory(torch.zeros(1), torch.tensor([[0.0, 0.1, 0.0, 0.0]], dtype=torch.float64), torch.zeros(1, 4, dtype=torch.float64))
+        >>> tc.potential_energy(chain, path, "bond").round(decimals=6).tolist()
+        [[0.0025, 0.005, 0.0025, 0.0]]
     """
     checked(chain, trajectory)
     checks.choice("definition", definition, DEFINITIONS)
@@ -58,12 +75,38 @@ def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "si
 
 
 def particle_energy(chain: Chain, trajectory: Trajectory, definition: str = "site") -> Tensor:
-    """Total energy of every particle (Eq. 36; Eq. A3 for "bond"), (*batch, time, particle)."""
+    """Total energy of every particle (Eq. 36; Eq. A3 for "bond"), (*batch, time, particle).
+
+    Args:
+        chain: the chain of the trajectory.
+        trajectory: displacement and velocity (*batch, time, particle).
+        definition: "site" or "bond", see :func:`potential_energy`.
+
+    Raises:
+        FieldError: for "site" with Hertz contacts.
+
+    Example:
+        >>> chain = tc.Chain(tc.Disorder().masses(64, 3, 0), boundary="fixed")
+        >>> energy = tc.particle_energy(chain, tc.evolve(chain, tc.impulse(chain), [0.0, 20.0], method="modes"))
+        >>> tuple(energy.shape), torch.allclose(energy[:, 0].sum(-1), energy[:, 1].sum(-1))
+        ((3, 2, 64), True)
+    """
     return kinetic_energy(chain, trajectory) + potential_energy(chain, trajectory, definition)
 
 
 def total_energy(chain: Chain, trajectory: Trajectory) -> Tensor:
-    """Energy of the whole chain relative to the precompressed state (Eq. 41), (*batch, time)."""
+    """Energy of the whole chain relative to the precompressed state (Eq. 41), (*batch, time).
+
+    Args:
+        chain: of any contact law.
+        trajectory: displacement and velocity (*batch, time, particle).
+
+    Example:
+        >>> chain = tc.Chain(tc.Disorder().masses(64, 1, 0))
+        >>> energy = tc.total_energy(chain, tc.evolve(chain, tc.standing_wave(chain, tone=5), [0.0, 100.0], method="modes"))
+        >>> torch.allclose(energy[:, 0], energy[:, 1])
+        True
+    """
     checked(chain, trajectory)
     return checks.finite("energy of trajectory", chain.energy(trajectory.displacement, trajectory.velocity), "time")
 
@@ -78,7 +121,14 @@ def require_linear(chain: Chain, remedy: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class EnergyMatrices:
-    """KE (Eq. 29), PE (Eq. 32) and their sum TE (Eq. 35), each (*batch, time, particle, particle)."""
+    """KE (Eq. 29), PE (Eq. 32) and their sum TE (Eq. 35), each (*batch, time, particle, particle).
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(8))
+        >>> found = tc.energy_matrices(chain, tc.evolve(chain, tc.impulse(chain), [0.0, 3.0], method="modes"))
+        >>> tuple(found.total.shape)
+        (2, 8, 8)
+    """
 
     kinetic: Tensor
     potential: Tensor
@@ -90,6 +140,20 @@ def energy_matrices(chain: Chain, trajectory: Trajectory) -> EnergyMatrices:
 
     N times the memory of the diagonal, which is all that the rest of the library uses: for looking at the
     correlations between particles.
+
+    Args:
+        chain: N particles.
+        trajectory: (*batch, time, particle).
+
+    Returns:
+        EnergyMatrices, each (*batch, time, particle, particle).
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(8, dtype=torch.float64))
+        >>> path = tc.evolve(chain, tc.impulse(chain), [3.0], method="modes")
+        >>> diagonal = tc.energy_matrices(chain, path).total.diagonal(dim1=-2, dim2=-1)
+        >>> torch.allclose(diagonal, tc.particle_energy(chain, path))
+        True
     """
     checked(chain, trajectory)
     require_linear(chain, "total_energy or particle_energy with definition 'bond'")
@@ -112,6 +176,10 @@ def energy_center(energy: Tensor) -> Tensor:
 
     Raises:
         FieldError: if the total energy of a state is not positive.
+
+    Example:
+        >>> tc.energy_center(torch.tensor([[0.0, 1.0, 1.0, 0.0]])).tolist()
+        [2.5]
     """
     energy = _per_particle(energy)
     return (energy @ _sites(energy)) / _positive_total(energy)
@@ -121,6 +189,10 @@ def energy_width(energy: Tensor) -> Tensor:
     """Mean squared width r^2(t) about the center of energy (Eq. 38), (*batch, time), in squared particle distances.
 
     Not a square root: the paper's r^2. Takes and raises what :func:`energy_center` does.
+
+    Example:
+        >>> tc.energy_width(torch.tensor([[0.0, 1.0, 1.0, 0.0]])).tolist()
+        [0.25]
     """
     energy = _per_particle(energy)
     offset = _sites(energy) - energy_center(energy)[..., None]

@@ -28,6 +28,12 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
 
     Returns:
         (*batch, time, N//2 + 1) in the unit of energy.
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(16, dtype=torch.float64))
+        >>> path = tc.evolve(chain, tc.standing_wave(chain, tone=5), [0.0, 7.0], method="modes")
+        >>> tc.wavenumber_energy(chain, path).argmax(-1).tolist()  # all in tone 5: no disorder, no transfer
+        [5, 5]
     """
     checked(chain, trajectory)
     checks.choice("definition", definition, DEFINITIONS)
@@ -72,7 +78,17 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def wavenumber_energy_matrix(matrices: EnergyMatrices) -> Tensor:
-    """DFT TE DFT^-1 in full (Eq. 42), complex, (*batch, time, wavenumber, wavenumber), wavenumbers 2 pi (0..N-1) / N."""
+    """DFT TE DFT^-1 in full (Eq. 42), complex, (*batch, time, wavenumber, wavenumber), wavenumbers 2 pi (0..N-1) / N.
+
+    Args:
+        matrices: see :func:`energy_matrices`; N times the memory of what :func:`wavenumber_energy` needs.
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(8, dtype=torch.float64))
+        >>> path = tc.evolve(chain, tc.standing_wave(chain, tone=2), [1.0], method="modes")
+        >>> tuple(tc.wavenumber_energy_matrix(tc.energy_matrices(chain, path)).shape)
+        (1, 8, 8)
+    """
     checks.instance("matrices", matrices, EnergyMatrices)
     total = checks.real_tensor("matrices.total", matrices.total)
     n = total.shape[-1] if total.ndim > 1 else 0
@@ -101,6 +117,13 @@ def band_energy(
 
     Raises:
         FieldError: if the bands do not divide the tones, or a state to be normalized has no energy.
+
+    Example:
+        >>> chain = tc.Chain(tc.Disorder().masses(64, 1, 0))
+        >>> path = tc.evolve(chain, tc.standing_wave(chain, tone=22), [0.0, 50.0], method="modes")
+        >>> bands = tc.band_energy(chain, path, n_bands=8)
+        >>> tuple(bands.shape), bands[0, 0].argmax().item() + 1  # tone 22 lies in band 6
+        ((1, 2, 8), 6)
     """
     checked(chain, trajectory)
     checks.truth("normalize", normalize)
@@ -110,7 +133,18 @@ def band_energy(
 
 
 def zero_wavenumber_share(chain: Chain, trajectory: Trajectory) -> Tensor:
-    """Share of the total energy at k = 0, which no band holds, (*batch, time)."""
+    """Share of the total energy at k = 0, which no band holds, (*batch, time).
+
+    Args:
+        chain: linear contacts.
+        trajectory: displacement and velocity (*batch, time, particle).
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(8, dtype=torch.float64))
+        >>> path = tc.evolve(chain, tc.impulse(chain), [0.0], method="modes")
+        >>> round(tc.zero_wavenumber_share(chain, path).item(), 3)  # a kick moves the ring as a whole
+        0.125
+    """
     energy = wavenumber_energy(chain, trajectory)
     return _normalized(energy[..., :1], energy)[..., 0]
 
@@ -151,6 +185,12 @@ def long_time_band_energy(
 
     Returns:
         (*batch, *any, band).
+
+    Example:
+        >>> chain = tc.Chain(tc.Disorder().masses(64, 1, 0))
+        >>> late = tc.long_time_band_energy(chain, tc.standing_wave(chain, tone=22), n_bands=8)
+        >>> tuple(late.shape), round(late.sum().item(), 2)
+        ((1, 8), 1.0)
     """
     checks.instance("chain", chain, Chain)
     checks.instance("state", state, State)
@@ -214,6 +254,17 @@ def basis_fraction(strength: float, n_bands: int) -> Tensor:
 
     A postulate for low bands; the exact long-time share is :func:`long_time_band_energy` (at xi = 0.3 in band 10
     it is 0.55 where Psi is 0.19).
+
+    Args:
+        strength: xi.
+        n_bands: B.
+
+    Returns:
+        (band,), between 0 and 1.
+
+    Example:
+        >>> [round(share, 3) for share in tc.basis_fraction(0.3, 32)[[0, 9, 31]].tolist()]
+        [0.945, 0.186, 0.031]
     """
     strength = checks.number("strength", strength, at_least=0)
     band = torch.arange(1, checks.integer("n_bands", n_bands, 1, 10**6) + 1, dtype=torch.float64)

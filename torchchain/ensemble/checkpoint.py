@@ -42,7 +42,12 @@ _NAME = re.compile(r"(\d{5})-(\d{5}|base)\.safetensors")
 
 
 class CheckpointWarning(UserWarning):
-    """A checkpoint that could not be read or written; the run goes on without it."""
+    """A checkpoint that could not be read or written; the run goes on without it.
+
+    Example:
+        >>> import warnings
+        >>> warnings.simplefilter("error", tc.CheckpointWarning)  # stop rather than go on without a checkpoint
+    """
 
 
 class Interrupted(KeyboardInterrupt):
@@ -70,6 +75,15 @@ class Checkpoint:
 
     Attributes:
         resumed: realizations that the present run took over.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> scene = tc.Scene(n_particles=16, n_bands=2, realizations=8, times=[0.0, 1.0])
+        >>> kept = tc.Checkpoint(mkdtemp(), every=0)
+        >>> first = tc.band_transfer(scene, method="modes", checkpoint=kept)
+        >>> again = tc.band_transfer(scene, method="modes", checkpoint=kept)  # from the folder, to the last bit
+        >>> torch.equal(first.mean, again.mean)
+        True
     """
 
     def __init__(self, folder: str | Path, every: float = EVERY) -> None:

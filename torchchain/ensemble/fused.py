@@ -59,6 +59,12 @@ def energy_moments(chain: Chain, state: State, times: Any, definition: str = "si
 
     Raises:
         FieldError: as ``evolve`` and ``energy_center`` do.
+
+    Example:
+        >>> chain = tc.Chain(tc.Disorder().masses(64, 1, 0), boundary="fixed")
+        >>> moments = tc.energy_moments(chain, tc.impulse(chain), [0.0, 10.0, 20.0])
+        >>> tuple(moments.center.shape), round(moments.center[0, 0].item(), 6)
+        ((1, 3), 1.0)
     """
     checks.choice("definition", definition, energy.DEFINITIONS)
     times = checks.times("times", times)

@@ -43,6 +43,12 @@ class Observable:
         passes: elementwise passes over a state that computing it takes, for the plan's estimate of time.
         kernel: what the stencil's kernels measure it as without storing states: "bands", or "total", "center" or
             "width" of the energy, which come together.
+
+    Example:
+        >>> speed = tc.Observable("speed", ("time",), "initial overlap / time", "largest speed",
+        ...                       lambda scene, chain, trajectory: trajectory.velocity.abs().amax(-1), local=True)
+        >>> speed.name, speed.axes
+        ('speed', ('time',))
     """
 
     name: str

@@ -56,6 +56,11 @@ class Scene(Printed):
 
     Raises:
         FieldError, FieldTypeError: one line with the field, the rule and the value.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=128, n_bands=16, disorder=tc.Disorder(strength=0.1), times=[0.0, 10.0], realizations=10)
+        >>> tuple(scene.chain(range(10)).masses.shape), tuple(scene.times.shape)
+        ((10, 128), (2,))
     """
 
     n_particles: int = 256

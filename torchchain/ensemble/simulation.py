@@ -45,6 +45,15 @@ def simulate(
         Dataset with a variable and its ``_stderr`` for every observable, axes ([tone,] time, particle | wavenumber |
         band), coordinates counted from 1, units in the attributes; realized mass moments in the attributes.
         A single realization of a disordered chain has the standard error infinity.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, boundary="fixed", excitation=tc.Impulse(site=1), times=[0.0, 10.0, 20.0],
+        ...                  observables=("center", "width"), realizations=10)
+        >>> result = tc.simulate(scene, method="modes")
+        >>> sorted(result.data_vars)
+        ['center', 'center_stderr', 'width', 'width_stderr']
+        >>> result.center.attrs["units"]
+        'particle'
     """
     scene = planning.resolved(scene)
     ensemble = ensemble_moments(

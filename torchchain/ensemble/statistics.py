@@ -39,7 +39,12 @@ class Moments:
 
 
 def total_variation(p: Tensor, q: Tensor) -> Tensor:
-    """Distance of two distributions over bands, sum over bands of |p - q| / 2, (*batch,) from (*batch, band)."""
+    """Distance of two distributions over bands, sum over bands of |p - q| / 2, (*batch,) from (*batch, band).
+
+    Example:
+        >>> tc.total_variation(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.5, 0.5, 0.0])).item()
+        0.5
+    """
     p, q = checks.real_tensor("p", p), checks.real_tensor("q", q)
     if p.ndim == 0 or q.ndim == 0 or p.shape[-1] != q.shape[-1]:
         raise checks.fail("q", f"have the bands of p, shape {tuple(p.shape)}", f"shape {tuple(q.shape)}")
@@ -54,6 +59,11 @@ def statistical_distance(stderr: Tensor) -> Tensor:
     """Expected total variation between two independent ensembles whose means have this standard error, (*batch,).
 
     The difference of two normal means of standard error s has the mean absolute value 2 s / sqrt(pi).
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=20, times=[0.0, 5.0, 50.0])
+        >>> tc.statistical_distance(tc.band_transfer(scene, method="modes").stderr).shape
+        torch.Size([8, 3])
     """
     checks.instance("stderr", stderr, Tensor)
     if not stderr.is_floating_point() or stderr.layout != torch.strided or stderr.is_meta or stderr.ndim == 0:

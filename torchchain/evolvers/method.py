@@ -35,6 +35,11 @@ class Method:
         phase_error: c of the error c w^(order + 1) step^order t of a mode of frequency w; nan where it is not known.
         forces_per_step: evaluations of the contact forces in a step.
         stability_limit: largest stable w_max step; None where no step is limited, or none is stable.
+
+    Example:
+        >>> method = tc.METHODS["chebyshev"]
+        >>> method.order.split()[0], method.contacts, sorted(method.options)
+        ('exact', ('linear',), ['accuracy', 'bound', 'compiled'])
     """
 
     name: str
@@ -75,6 +80,17 @@ def register_method(method: Method) -> Method:
 
     Raises:
         FieldError, FieldTypeError: for a name that is taken or no identifier, or for what is no Method.
+
+    Example:
+        >>> def resting(chain, state, **options):  # a method that leaves everything as it was
+        ...     def advance(times):
+        ...         size = (*state.displacement.shape[:-1], len(times), state.displacement.shape[-1])
+        ...         return tc.Trajectory(times, state.displacement.unsqueeze(-2).expand(size), state.velocity.unsqueeze(-2).expand(size))
+        ...     return advance
+        >>> _ = tc.register_method(tc.Method("resting", resting, "nothing moves"))
+        >>> chain = tc.Chain(torch.ones(4))
+        >>> tuple(tc.evolve(chain, tc.impulse(chain), [0.0, 1.0], method="resting").velocity.shape)
+        (2, 4)
     """
     checks.instance("method", method, Method)
     if not (isinstance(method.name, str) and method.name.isidentifier()):

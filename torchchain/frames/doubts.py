@@ -107,6 +107,11 @@ def check_energy(name: str, chain: Chain, path: Trajectory) -> None:
         name: of the file, for the warnings.
         chain: in the units of the trajectory.
         path: (time, particle).
+
+    Example:
+        >>> chain = tc.Chain(tc.Disorder().masses(32, 1, 0)[0])
+        >>> path = tc.evolve(chain, tc.standing_wave(chain, tone=3), [0.0, 10.0], method="modes")
+        >>> tc.frames.check_energy("run.dump", chain, path)  # energy is kept: no warning
     """
     kinetic = (chain.masses * path.velocity.square()).sum(-1) / 2
     total = kinetic + chain.contact_energy(path.displacement).sum(-1)

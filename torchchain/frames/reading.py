@@ -83,6 +83,16 @@ class Frames:
 
     What holds for all frames is that of the first: ids, masses, radii, box, contacts. Each frame is checked against it as
     it is read. Units are the file's, or those of :meth:`scaled`.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import mkdtemp
+        >>> frame = "ITEM: TIMESTEP\\n{0}\\nITEM: NUMBER OF ATOMS\\n2\\nITEM: ATOMS id mass xu vx\\n1 0.9 0 {0}\\n2 1.1 1 0\\n"
+        >>> path = Path(mkdtemp(), "run.dump")
+        >>> _ = path.write_text(frame.format(0) + frame.format(1))
+        >>> frames = tc.read_frames(path, time_step=0.01)
+        >>> len(frames), frames.times.tolist(), frames[1].velocities.tolist()
+        (2, [0.0, 0.01], [[1.0], [0.0]])
     """
 
     def __init__(
@@ -416,6 +426,14 @@ def convert(
 
     Returns:
         The path of the new file.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import mkdtemp
+        >>> path = Path(mkdtemp(), "run.dump")
+        >>> _ = path.write_text("ITEM: TIMESTEP\\n0\\nITEM: NUMBER OF ATOMS\\n2\\nITEM: ATOMS id mass xu vx\\n1 1 0 0\\n2 1 1 0\\n")
+        >>> tc.frames.convert(path, path.with_name("run.nc"), time_step=0.01).name
+        'run.nc'
     """
     frames = read_frames(path, contacts, format, **options)
     target = Path(out)

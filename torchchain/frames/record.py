@@ -11,7 +11,21 @@ AXES = ("x", "y", "z")
 
 
 class FramesWarning(UserWarning):
-    """Something in a file that makes a result doubtful, with its file, frame and field."""
+    """Something in a file that makes a result doubtful, with its file, frame and field.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import mkdtemp
+        >>> import warnings
+        >>> path = Path(mkdtemp(), "cut.dump")
+        >>> head = "ITEM: TIMESTEP\\n0\\nITEM: NUMBER OF ATOMS\\n2\\nITEM: ATOMS id mass xu vx\\n1 1 0 0\\n"
+        >>> _ = path.write_text(head + "2 1 1 0\\n" + head)  # the second frame lacks a particle
+        >>> with warnings.catch_warnings(record=True) as told:
+        ...     warnings.simplefilter("always")
+        ...     frames = tc.read_frames(path, time_step=0.01)
+        >>> told[0].category.__name__, len(frames)
+        ('FramesWarning', 1)
+    """
 
 
 @dataclass(frozen=True)
@@ -21,6 +35,11 @@ class Box:
     Attributes:
         lower, upper: bounds along x, y, z.
         periodic: whether what leaves on one side comes in on the other, for each axis.
+
+    Example:
+        >>> box = tc.frames.Box((0.0, 0.0, 0.0), (10.0, 1.0, 1.0), (True, False, False))
+        >>> box.lengths
+        tensor([10.,  1.,  1.], dtype=torch.float64)
     """
 
     lower: tuple[float, float, float]
@@ -41,6 +60,11 @@ class Contacts:
         pairs: positions in the frame's particles, counted from 0, (contact, 2), int64; -1 for a wall.
         overlap: sum of radii less distance, (contact,), or None where the file does not say.
         normal_force: repulsion, (contact,), or None.
+
+    Example:
+        >>> contacts = tc.frames.Contacts(torch.tensor([[0, 1], [1, -1]]), overlap=torch.tensor([0.1, 0.2]))
+        >>> contacts.pairs[:, 1].tolist()  # the second contact is with a wall
+        [1, -1]
     """
 
     pairs: Tensor
@@ -64,6 +88,15 @@ class Frame:
         masses, radii: (particle,), or None.
         box: or None.
         contacts: or None.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import mkdtemp
+        >>> path = Path(mkdtemp(), "run.dump")
+        >>> _ = path.write_text("ITEM: TIMESTEP\\n0\\nITEM: NUMBER OF ATOMS\\n2\\nITEM: ATOMS id mass xu vx\\n1 1 0 0\\n2 1 1 0\\n")
+        >>> frame = tc.read_frames(path, time_step=0.01)[0]
+        >>> frame.axes, frame.ids.tolist(), frame.positions.tolist()
+        (('x',), [1, 2], [[0.0], [1.0]])
     """
 
     number: int
@@ -87,6 +120,11 @@ class VectorTrajectory:
     Attributes:
         times: (time,).
         displacement, velocity: (time, particle, axis).
+
+    Example:
+        >>> still = torch.zeros(1, 5, 3)
+        >>> tc.frames.VectorTrajectory(torch.zeros(1), still, still).displacement.shape
+        torch.Size([1, 5, 3])
     """
 
     times: Tensor

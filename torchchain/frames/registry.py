@@ -68,6 +68,10 @@ class Format:
         options: name to what it means, those of :func:`torchchain.read_frames` that the format looks at.
         match: contacts belong to the frame with the same "step" or "time".
         sibling: (path) to a mass for each id, from a file beside it, or None.
+
+    Example:
+        >>> tc.frames.FORMATS["lammps"].holds
+        'particles'
     """
 
     name: str

@@ -22,6 +22,11 @@ class ContactUnits:
 
     Attributes:
         mass, stiffness, length: in the file's units; positive.
+
+    Example:
+        >>> units = tc.frames.ContactUnits(mass=2.0, stiffness=8.0, length=0.01)
+        >>> units.unit("time")  # sqrt(mass / stiffness)
+        0.5
     """
 
     mass: float

@@ -25,6 +25,10 @@ class AdamSettings:
         steps: largest number of steps.
         learning_rate: of the parameters in units of their typical size.
         tolerance: stop when the loss falls by less than this fraction in 50 steps.
+
+    Example:
+        >>> tc.master.AdamSettings(steps=50).constraint
+        'exact'
     """
 
     constraint: str = "exact"
@@ -43,7 +47,17 @@ class AdamSettings:
 
 @dataclass(frozen=True)
 class AdamReport:
-    """How the search went: whether the loss, a mean squared misfit, settled, its first and smallest value, the constraint."""
+    """How the search went: whether the loss, a mean squared misfit, settled, its first and smallest value, the constraint.
+
+    Example:
+        >>> import warnings
+        >>> transfer = tc.band_transfer(tc.Scene(n_particles=64, n_bands=8, realizations=20), method="modes")
+        >>> with warnings.catch_warnings():
+        ...     warnings.simplefilter("ignore")  # 50 steps are few
+        ...     report = tc.calibrate(transfer, method="adam", steps=50).calibration.report.fit
+        >>> report.steps <= 50, report.loss < report.first_loss
+        (True, True)
+    """
 
     converged: bool
     steps: int

@@ -130,6 +130,13 @@ def calibrate(
     Warns:
         FitWarning: naming how many entries of the nonlinear fit did not converge, or that Adam did not, or a model with
             memory that goes far outside the energy there is.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40)
+        >>> transfer = tc.band_transfer(scene, method="modes")
+        >>> master = tc.calibrate(transfer, model="basis_matrix", bootstrap=0)
+        >>> tuple(master.rates.shape), master.rates.sum(-1).abs().max().item() < 1e-12
+        ((8, 8), True)
     """
     checks.instance("transfer", transfer, BandTransfer)
     asked = recipe(transfer, method, model, window, **settings)

@@ -32,6 +32,12 @@ class ChapmanKolmogorov:
         stderr: of their difference, by delete-one jackknife over blocks of realizations, [source, time, receiver].
         distance: total variation of the two, [source, time].
         statistical: what it would be if the chain were Markovian, [source, time].
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40, times=[0.0, 8.0, 16.0, 32.0])
+        >>> test = tc.chapman_kolmogorov(tc.band_transfer(scene, method="modes"), lag=8.0, multiples=(1, 2, 4))
+        >>> tuple(test.measured.shape), tuple(test.distance.shape)
+        ((8, 3, 8), (8, 3))
     """
 
     lag: float
@@ -61,6 +67,12 @@ def chapman_kolmogorov(
 
     Raises:
         FieldError: if the transfer holds no such time.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40, times=[0.0, 8.0, 16.0])
+        >>> test = tc.chapman_kolmogorov(tc.band_transfer(scene, method="modes"), lag=8.0, multiples=(2,))
+        >>> bool(test.distance.mean() > 3 * test.statistical.mean())  # the bands have a memory
+        True
     """
     checks.instance("transfer", transfer, BandTransfer)
     lag = checks.number("lag", lag, above=0)
@@ -92,6 +104,12 @@ def implied_timescales(transfer: BandTransfer, lags: Any) -> tuple[Tensor, Tenso
     Returns:
         timescales and standard errors, (lag, band - 1): the eigenvalue 1 of conserved energy is left out; infinite
         where noise has carried an eigenvalue to 1 or beyond.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40, times=[0.0, 4.0, 8.0])
+        >>> timescales, errors = tc.implied_timescales(tc.band_transfer(scene, method="modes"), [4.0, 8.0])
+        >>> tuple(timescales.shape)
+        (2, 7)
     """
     checks.instance("transfer", transfer, BandTransfer)
     lags = checks.times("lags", lags)

@@ -33,7 +33,18 @@ GAINED_SHARE = 1e-2
 
 
 class TrustWarning(UserWarning):
-    """A prediction beyond what the model was compared with, or with energies that cannot be."""
+    """A prediction beyond what the model was compared with, or with energies that cannot be.
+
+    Example:
+        >>> import warnings
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40, times=torch.linspace(0, 5, 21))
+        >>> master = tc.calibrate(tc.band_transfer(scene, method="modes"), model="paper", method="linear")
+        >>> with warnings.catch_warnings(record=True) as told:
+        ...     warnings.simplefilter("always")
+        ...     _ = master.solve(torch.eye(8, dtype=torch.float64), [0.0, 1e4])  # far beyond the chains
+        >>> any(issubclass(warning.category, tc.TrustWarning) for warning in told)
+        True
+    """
 
 
 class MasterEquation(Printed, nn.Module):
@@ -45,6 +56,15 @@ class MasterEquation(Printed, nn.Module):
         model: the reduced model.
         calibration: where it comes from; None for a model of your own.
         uncertainty: standard errors by bootstrap; None if there are none.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40, times=torch.linspace(0, 50, 51))
+        >>> master = tc.calibrate(tc.band_transfer(scene, method="modes"), model="paper", method="linear")
+        >>> start = torch.zeros(8, dtype=torch.float64)
+        >>> start[4] = 1.0  # all in band 5
+        >>> energy = master.solve(start, [0.0, 10.0, 50.0], method="expm")
+        >>> tuple(energy.shape), torch.allclose(energy.sum(-1), torch.ones(3, dtype=torch.float64))
+        ((3, 8), True)
     """
 
     def __init__(

@@ -41,6 +41,13 @@ class MasterFamily(Printed):
 
     Raises:
         FieldError: if they differ in more than the strength of the disorder.
+
+    Example:
+        >>> scenes = [tc.Scene(n_particles=32, n_bands=4, realizations=40, disorder=tc.Disorder(strength=xi)) for xi in (0.1, 0.2)]
+        >>> transfers = [tc.band_transfer(scene, method="modes") for scene in scenes]
+        >>> family = tc.MasterFamily([tc.calibrate(t, model="memory", order=(1, 1), bootstrap=0) for t in transfers])
+        >>> family.strengths, family.at(0.15).n_bands
+        ((0.1, 0.2), 4)
     """
 
     def __init__(self, members: Sequence[MasterEquation]) -> None:
@@ -180,6 +187,16 @@ def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> Mast
     Args:
         transfers: of ensembles that differ in the strength of their disorder (and in seeds, realizations and times).
         settings: of :func:`torchchain.calibrate`, but method and model.
+
+    Returns:
+        MasterFamily, ``at(strength)`` of which is a MasterEquation.
+
+    Example:
+        >>> scenes = [tc.Scene(n_particles=32, n_bands=4, realizations=40, disorder=tc.Disorder(strength=xi)) for xi in (0.1, 0.2)]
+        >>> transfers = [tc.band_transfer(scene, method="modes") for scene in scenes]
+        >>> family = tc.calibrate_family(transfers, order=(1, 1), bootstrap=0)
+        >>> family.at(0.15).transfer([0.0, 10.0]).shape[0]
+        4
     """
     if not isinstance(transfers, (list, tuple)) or not transfers:
         raise checks.FieldTypeError(f"transfers must be a list of band transfers, got {checks.shown(transfers)}")

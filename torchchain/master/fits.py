@@ -16,12 +16,29 @@ from torchchain import checks
 
 
 class FitWarning(UserWarning):
-    """Some entries of a fit did not converge."""
+    """Some entries of a fit did not converge.
+
+    Example:
+        >>> import warnings
+        >>> transfer = tc.band_transfer(tc.Scene(n_particles=64, n_bands=8, realizations=4), method="modes")
+        >>> with warnings.catch_warnings(record=True) as told:
+        ...     warnings.simplefilter("always")
+        ...     _ = tc.calibrate(transfer, method="nonlinear")
+        >>> any(issubclass(warning.category, tc.FitWarning) for warning in told)
+        True
+    """
 
 
 @dataclass(frozen=True)
 class AnalyticReport:
-    """q0 of Eq. 50 and its standard error."""
+    """q0 of Eq. 50 and its standard error.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40)
+        >>> report = tc.calibrate(tc.band_transfer(scene, method="modes"), method="analytic", bootstrap=0).calibration.report.fit
+        >>> 0 < report.q0_stderr < report.q0
+        True
+    """
 
     q0: float
     q0_stderr: float
@@ -29,7 +46,12 @@ class AnalyticReport:
 
 @dataclass(frozen=True)
 class NonlinearReport:
-    """Pairs of bands (source, receiver), counted from 1, in which the fit did not converge."""
+    """Pairs of bands (source, receiver), counted from 1, in which the fit did not converge.
+
+    Example:
+        >>> tc.master.NonlinearReport(unconverged=((1, 2),))
+        NonlinearReport(unconverged=((1, 2),))
+    """
 
     unconverged: tuple[tuple[int, int], ...]
 

@@ -39,6 +39,15 @@ class MemoryModel(TransferModel):
         decay: g of the exponentials [exponential], per unit time.
         pair_decay, pair_frequency: g and w of the pairs [pair], per unit time.
         damping: d [receiver], per unit time.
+
+    Example:
+        >>> one = torch.eye(2, dtype=torch.float64)
+        >>> half = torch.full((2, 2), 0.5, dtype=torch.float64)
+        >>> none = torch.zeros(0, dtype=torch.float64)
+        >>> model = tc.MemoryModel(rates=0.1 * (half - one), basis=half, amplitudes=(one - half)[None],
+        ...                        decay=torch.tensor([0.1], dtype=torch.float64), pair_decay=none, pair_frequency=none)
+        >>> model.transfer(torch.tensor([0.0, 1000.0], dtype=torch.float64))[0].round(decimals=3).tolist()
+        [[1.0, 0.0], [0.5, 0.5]]
     """
 
     kind: ClassVar[str] = "memory"
@@ -146,7 +155,12 @@ class MemoryModel(TransferModel):
 
 @dataclass(frozen=True)
 class ProjectionSettings:
-    """Settings of the projection: the order, None for the smallest that reaches the ensemble's own error."""
+    """Settings of the projection: the order, None for the smallest that reaches the ensemble's own error.
+
+    Example:
+        >>> tc.master.ProjectionSettings(order=(1, 2))
+        ProjectionSettings(order=(1, 2))
+    """
 
     order: tuple[int, int] | None = None
 
@@ -164,7 +178,14 @@ class ProjectionSettings:
 
 @dataclass(frozen=True)
 class ProjectionReport:
-    """Whether the search for the rates ended by itself, the root mean square misfit, and the order."""
+    """Whether the search for the rates ended by itself, the root mean square misfit, and the order.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40)
+        >>> master = tc.calibrate(tc.band_transfer(scene, method="modes"), model="memory", order=(1, 1), bootstrap=0)
+        >>> master.calibration.report.fit.order
+        (1, 1)
+    """
 
     converged: bool
     misfit: float

@@ -22,6 +22,13 @@ class Embedding:
         start: (band, state).
         generator: (state, state).
         readout: (state, band).
+
+    Example:
+        >>> rates = torch.tensor([[-0.2, 0.2], [0.2, -0.2]], dtype=torch.float64)
+        >>> embedding = tc.RateModel(rates, torch.zeros(2, dtype=torch.float64)).embedding()
+        >>> moved = embedding.start @ torch.linalg.matrix_exp(embedding.generator * 1000.0) @ embedding.readout
+        >>> moved.round(decimals=3).tolist()
+        [[0.5, 0.5], [0.5, 0.5]]
     """
 
     start: Tensor
@@ -39,6 +46,20 @@ class TransferModel(nn.Module):
         kind: what its files call it.
         axes: of each tensor that makes the model: "band", or any other word for an axis of any length.
         rates_meaning: what :attr:`rates` are, in words.
+
+    Example:
+        >>> class Settling(tc.TransferModel):  # a model of your own: every band relaxes to its share in Pi at one rate
+        ...     kind, axes, n_parameters = "settling", {"basis": ("source", "receiver"), "damping": ("band",)}, 1
+        ...     def __init__(self, basis, damping=None):
+        ...         super().__init__()
+        ...         self.basis, self.damping = basis, torch.zeros(len(basis)) if damping is None else damping
+        ...     def embedding(self):
+        ...         n, one = len(self.basis), torch.eye(len(self.basis), dtype=self.basis.dtype)
+        ...         rate = torch.cat([torch.zeros(n), torch.full((n,), -0.1)]).to(one)
+        ...         return tc.master.Embedding(torch.cat([self.basis, one - self.basis], 1), rate.diag(), torch.cat([one, one]))
+        >>> model = Settling(torch.full((2, 2), 0.5, dtype=torch.float64))
+        >>> model.transfer(torch.tensor([0.0, 1000.0], dtype=torch.float64))[0].round(decimals=3).tolist()
+        [[1.0, 0.0], [0.5, 0.5]]
     """
 
     kind: ClassVar[str]

@@ -42,6 +42,13 @@ class RateModel(TransferModel):
 
     Raises:
         FieldError: for a shape that does not fit, a value that is not finite, a basis row with a sum above 1.
+
+    Example:
+        >>> rates = torch.tensor([[-0.2, 0.2], [0.2, -0.2]], dtype=torch.float64)
+        >>> model = tc.RateModel(rates, basis=torch.tensor([0.5, 0.0], dtype=torch.float64))
+        >>> late = model.transfer(torch.tensor([1000.0], dtype=torch.float64))
+        >>> late[0, 0].round(decimals=3).tolist()  # half stays in band 1, the rest is shared
+        [0.75, 0.25]
     """
 
     kind: ClassVar[str] = "markov"
@@ -103,6 +110,12 @@ class SwingInModel(RateModel):
     Args:
         rates, basis, damping: see :class:`RateModel`.
         delay: tau, the mean time at rest, per source or one for all.
+
+    Example:
+        >>> rates = torch.tensor([[-0.2, 0.2], [0.2, -0.2]], dtype=torch.float64)
+        >>> model = tc.SwingInModel(rates, torch.zeros(2, dtype=torch.float64), delay=torch.tensor(2.0, dtype=torch.float64))
+        >>> model.transfer(torch.tensor([1.0], dtype=torch.float64))[0, 0, 1].item() < 0.1  # without delay 0.16
+        True
     """
 
     kind: ClassVar[str] = "swing_in"

@@ -23,7 +23,12 @@ Fitted = tuple[TransferModel, Any]
 
 @dataclass(frozen=True)
 class NoSettings:
-    """Of a fit that has none."""
+    """Of a fit that has none.
+
+    Example:
+        >>> tc.master.NoSettings()
+        NoSettings()
+    """
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,10 @@ class Fit:
         least_times: that the window must hold.
         quick: whether error bars are drawn where nobody asks.
         check: ``check(settings, n_times)`` raises where so many times are too few.
+
+    Example:
+        >>> [fit.name for fit in tc.MODELS["paper"].fits]
+        ['analytic', 'linear', 'nonlinear', 'adam']
     """
 
     name: str
@@ -81,6 +90,11 @@ class ReducedModel:
         windows: ends of windows of time; selection takes it only if it reaches the ensemble's error within each.
         replicas: ``replicas(transfer, recipe, model, repeats)`` -> the models of ensembles in which the blocks are
             repeated, (replica, block), where that is quicker than to fit each from its energies.
+
+    Example:
+        >>> model = tc.MODELS["paper"]
+        >>> model.size(32, False, None), [fit.name for fit in model.fits][:2]
+        (1024, ['analytic', 'linear'])
     """
 
     name: str
@@ -145,6 +159,10 @@ class Recipe:
         model, fit: records; None: to be chosen.
         window: of the fits at short times.
         settings: an instance of ``fit.settings``.
+
+    Example:
+        >>> tc.Recipe(model=None, fit=None, window=(0.5, 2.0)).window
+        (0.5, 2.0)
     """
 
     model: ReducedModel | None

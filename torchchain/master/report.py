@@ -18,7 +18,12 @@ from torchchain.master.proof import ROUNDING, Certificate
 
 @dataclass(frozen=True)
 class Rung:
-    """One model that the selection tried: name, order where it has one, total variation from the blocks held out."""
+    """One model that the selection tried: name, order where it has one, total variation from the blocks held out.
+
+    Example:
+        >>> tc.master.Rung("memory", (2, 3), 0.012).model
+        'memory'
+    """
 
     model: str
     order: tuple[int, ...]
@@ -34,6 +39,12 @@ class Selection:
         held_out_distance: total variation of the chosen model, fitted to half of the blocks, from the other half.
         halves_distance: total variation of the two halves; both None where nothing was held out.
         tried: from the fewest fitted numbers up.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40)
+        >>> chosen = tc.calibrate(tc.band_transfer(scene, method="modes"), bootstrap=0).calibration.report.selection
+        >>> len(chosen.tried) >= 1, chosen.held_out_distance > 0
+        (True, True)
     """
 
     reason: str
@@ -44,7 +55,14 @@ class Selection:
 
 @dataclass(frozen=True)
 class Loss:
-    """The damping d of Eq. 51 [band], and the root mean square of the lost energy that it leaves unexplained."""
+    """The damping d of Eq. 51 [band], and the root mean square of the lost energy that it leaves unexplained.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=32, n_bands=4, realizations=8, damping=0.02, times=torch.linspace(0, 20, 41))
+        >>> transfer = tc.band_transfer(scene, method="damped", long_time=False)
+        >>> len(tc.calibrate(transfer, model="paper", method="linear").calibration.report.loss.rates)
+        4
+    """
 
     rates: tuple[float, ...]
     misfit: float
@@ -68,6 +86,12 @@ class Report:
         ordered: without disorder nothing moves, and nothing was fitted.
         coarsened_from: number of bands of the model that this one was made of.
         interpolated: strengths of a family and their weights, of which this one is the sum.
+
+    Example:
+        >>> transfer = tc.band_transfer(tc.Scene(n_particles=64, n_bands=8, realizations=40), method="modes")
+        >>> report = tc.calibrate(transfer, model="exact_psi", method="linear").calibration.report
+        >>> report.selection is None, report.bootstrap
+        (True, 20)
     """
 
     fit: Any = None
@@ -117,6 +141,12 @@ class Calibration:
         scene: of the chains; None for energies from elsewhere.
         report: see :class:`Report`.
         provenance: where energies without a scene come from.
+
+    Example:
+        >>> transfer = tc.band_transfer(tc.Scene(n_particles=64, n_bands=8, realizations=20), method="modes")
+        >>> found = tc.calibrate(transfer, model="paper", method="linear").calibration
+        >>> found.method, found.model, found.window, found.strength
+        ('linear', 'paper', (0.5, 2.0), 0.3)
     """
 
     method: str

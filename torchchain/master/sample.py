@@ -32,6 +32,12 @@ class Sample:
         damped: whether the chains lose energy.
         scene: of the chains, or None.
         distance: expected total variation of two whole ensembles at each time, (time,), or None.
+
+    Example:
+        >>> transfer = tc.band_transfer(tc.Scene(n_particles=64, n_bands=8, realizations=40), method="modes")
+        >>> sample = tc.master.Sample.of(transfer)
+        >>> sample.n_bands, sample.strength
+        (8, 0.3)
     """
 
     times: Tensor

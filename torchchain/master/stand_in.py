@@ -75,6 +75,11 @@ def plan(scene: Scene, artifact: str | Path | MasterEquation | None = None) -> P
 
     Raises:
         FieldError: if no method can treat the scene, or none reaches the tolerance.
+
+    Example:
+        >>> plan = tc.plan(tc.Scene(n_particles=64, n_bands=8, tolerance=1e-6))
+        >>> plan.predicted_error <= 1e-6, plan.dtype
+        (True, torch.float64)
     """
     return planning.plan(scene, None if artifact is None else partial(_stand_in, artifact=artifact))
 

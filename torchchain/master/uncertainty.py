@@ -39,6 +39,12 @@ class Uncertainty:
         rates_stderr, basis_stderr: of Q and Pi, [source, receiver].
         times: (time,), some of the calibration's, increasing.
         stderr: of the predicted share of the energy, [source, time, receiver].
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40)
+        >>> master = tc.calibrate(tc.band_transfer(scene, method="modes"), model="exact_psi", method="linear")
+        >>> tuple(master.uncertainty.rates_stderr.shape), tuple(master.standard_error(torch.eye(8, dtype=torch.float64), [10.0]).shape)
+        ((8, 8), (8, 1, 8))
     """
 
     rates_stderr: Tensor

@@ -13,16 +13,32 @@ from torchchain.chain.chain import Chain
 
 
 class SpectrumWarning(UserWarning):
-    """Frequencies so far apart that the slow modes have lost half of their digits."""
+    """Frequencies so far apart that the slow modes have lost half of their digits.
+
+    Example:
+        >>> issubclass(tc.SpectrumWarning, UserWarning)  # from normal_modes, where slow modes have few digits left
+        True
+    """
 
 
 class DecompositionError(RuntimeError):
-    """An eigen-solver returned modes that are not the chain's."""
+    """An eigen-solver returned modes that are not the chain's.
+
+    Example:
+        >>> issubclass(tc.DecompositionError, RuntimeError)  # the check of every decomposition raises it
+        True
+    """
 
 
 @dataclass(frozen=True, eq=False)
 class NormalModes:
-    """Frequencies (*batch, mode), ascending, and shapes (*batch, particle, mode) with shapes^T M shapes = 1 (Eq. 17)."""
+    """Frequencies (*batch, mode), ascending, and shapes (*batch, particle, mode) with shapes^T M shapes = 1 (Eq. 17).
+
+    Example:
+        >>> modes = tc.normal_modes(tc.Chain(torch.ones(4, dtype=torch.float64)))
+        >>> modes.frequencies.round(decimals=4).tolist(), tuple(modes.shapes.shape)
+        ([0.0, 1.4142, 1.4142, 2.0], (4, 4))
+    """
 
     frequencies: Tensor
     shapes: Tensor

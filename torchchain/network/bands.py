@@ -39,6 +39,10 @@ class ShellBands:
         kind: of the lattice.
         n_shells: per polarization.
         polarizations: ("longitudinal", "transverse"), or ("scalar",).
+
+    Example:
+        >>> tc.network.shell_bands(tc.lattice("triangular", (8, 8)), 4).labels[:2]
+        ('longitudinal 1', 'longitudinal 2')
     """
 
     kind: str
@@ -83,6 +87,12 @@ def band_energy(network: Lattice, trajectory: Trajectory, n_shells: int = 8, nor
         trajectory: displacement and velocity (*batch, time, particle, component).
         n_shells: per polarization.
         normalize: divide by the total energy, that of q = 0 included.
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (8, 8))
+        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (2, 0)), [0.0, 9.0], method="modes")
+        >>> tuple(tc.network.band_energy(sheet, path, n_shells=4).shape)  # longitudinal and transverse shells
+        (2, 8)
     """
     bands = shell_bands(network, n_shells)
     energy = wavenumber_energy(network, trajectory)
@@ -119,6 +129,11 @@ def plane_wave(
 
     Raises:
         FieldError: for a sine that vanishes on every particle, and for a direction that q = 0 does not have.
+
+    Example:
+        >>> wave = tc.network.plane_wave(tc.lattice("triangular", (8, 8)), turns=(1, 0), polarization="transverse")
+        >>> tuple(wave.displacement.shape)
+        (64, 2)
     """
     where = zone(network)
     numbers = [checks.integer("turns", t) for t in turns]
@@ -168,6 +183,11 @@ class BandWaves:
         state: (*batch, band, particle, component).
         turns: of each wave, (band, dimension).
         wavenumbers: |q| of each, (band,).
+
+    Example:
+        >>> waves = tc.network.band_waves(tc.lattice("triangular", (16, 16)), n_shells=4)
+        >>> tuple(waves.state.displacement.shape), tuple(waves.turns.shape)
+        ((8, 256, 2), (8, 2))
     """
 
     state: State
@@ -180,6 +200,17 @@ def band_waves(network: Lattice, n_shells: int, amplitude: float = 0.01, phase: 
 
     Raises:
         FieldError: for a shell that holds no wavevector of its own, naming it.
+
+    Args:
+        network: a periodic lattice.
+        n_shells: per polarization.
+        amplitude: of the displacement.
+        phase: "sin" or "cos".
+
+    Example:
+        >>> waves = tc.network.band_waves(tc.lattice("triangular", (16, 16)), n_shells=4)
+        >>> waves.wavenumbers.diff()[:3].gt(0).tolist()
+        [True, True, True]
     """
     bands, where = shell_bands(network, n_shells), zone(network)
     edges = bands.edges.to(where.lengths)
@@ -223,6 +254,15 @@ def long_time_band_energy(
         n_shells: per polarization.
         normalize: divide by the total energy.
         modes: of the network, where they are at hand.
+
+    Raises:
+        FieldError: for a lattice that is not periodic.
+
+    Example:
+        >>> sheet = tc.network.disordered(tc.lattice("triangular", (6, 6)), tc.Disorder(strength=0.3), seed=0)
+        >>> late = tc.network.long_time_band_energy(sheet, tc.network.plane_wave(sheet, (1, 0)), n_shells=2)
+        >>> late.shape[-1]
+        4
     """
     bands, where = shell_bands(network, n_shells), zone(network)
     network.check_state(state.displacement)

@@ -73,6 +73,11 @@ def diluted(network: Network, fraction: float, realizations: int | Iterable[int]
         network: without batch axes.
         fraction: the probability, 0 to 1.
         realizations, seed: as for :func:`disordered`.
+
+    Example:
+        >>> thinned = tc.network.diluted(tc.lattice("triangular", (10, 10)), fraction=0.2, realizations=3, seed=0)
+        >>> tuple(thinned.stiffness.shape)
+        (3, 300)
     """
     _one(network)
     fraction = checks.number("fraction", fraction, at_least=0, at_most=1)
@@ -98,6 +103,11 @@ def displaced(network: Network, strength: float, realization: int = 0, seed: int
         network: any.
         strength: standard deviation of the step along each direction, in the unit of the positions.
         realization, seed: one realization, as positions have no batch axes.
+
+    Example:
+        >>> moved = tc.network.displaced(tc.lattice("triangular", (6, 6)), strength=0.02, seed=0)
+        >>> tuple(moved.positions.shape)
+        (36, 2)
     """
     strength = checks.number("strength", strength, at_least=0)
     realization = checks.integer("realization", realization, 0, 2**63)

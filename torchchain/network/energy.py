@@ -16,13 +16,35 @@ DEFINITIONS = ("bond", "site")
 
 
 def kinetic_energy(network: Network, trajectory: Trajectory) -> Tensor:
-    """Kinetic energy of every particle, (*batch, time, particle)."""
+    """Kinetic energy of every particle, (*batch, time, particle).
+
+    Args:
+        network: the network of the trajectory.
+        trajectory: velocity (*batch, time, particle, component).
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (4, 4))
+        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0], method="modes")
+        >>> tc.network.kinetic_energy(sheet, path).sum().item()  # the wave starts at rest
+        0.0
+    """
     _, velocity = check_trajectory(network, trajectory)
     return (network.align(network.masses, velocity) * velocity.square()).sum(-1) / 2
 
 
 def bond_energy(network: Network, trajectory: Trajectory) -> Tensor:
-    """Energy stored in every bond, (*batch, time, bond); negative where a pushing bond turns more than it stretches."""
+    """Energy stored in every bond, (*batch, time, bond); negative where a pushing bond turns more than it stretches.
+
+    Args:
+        network: the network of the trajectory.
+        trajectory: displacement (*batch, time, particle, component).
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (4, 4))
+        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0], method="modes")
+        >>> torch.allclose(tc.network.bond_energy(sheet, path).sum(-1), tc.network.total_energy(sheet, path))  # at rest
+        True
+    """
     displacement, _ = check_trajectory(network, trajectory)
     return network.bond_energy(displacement)
 
@@ -35,6 +57,12 @@ def particle_energy(network: Network, trajectory: Trajectory, definition: str = 
         trajectory: displacement and velocity (*batch, time, particle, component).
         definition: "bond": half of the energy of each of its bonds (all of a bond to an anchor) besides the kinetic;
             "site": u . K u / 2 instead, which is negative on many particles.
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (4, 4))
+        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0, 5.0], method="modes")
+        >>> tuple(tc.network.particle_energy(sheet, path).shape)
+        (2, 16)
     """
     checks.choice("definition", definition, DEFINITIONS)
     kinetic = kinetic_energy(network, trajectory)
@@ -50,7 +78,18 @@ def particle_energy(network: Network, trajectory: Trajectory, definition: str = 
 
 
 def total_energy(network: Network, trajectory: Trajectory) -> Tensor:
-    """Energy of the whole network, (*batch, time)."""
+    """Energy of the whole network, (*batch, time).
+
+    Args:
+        network: any.
+        trajectory: displacement and velocity (*batch, time, particle, component).
+
+    Example:
+        >>> sheet = tc.network.disordered(tc.lattice("triangular", (6, 6)), tc.Disorder(strength=0.3), seed=0)
+        >>> energy = tc.network.total_energy(sheet, tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0, 50.0], method="modes"))
+        >>> torch.allclose(energy[..., 0], energy[..., 1])
+        True
+    """
     return kinetic_energy(network, trajectory).sum(-1) + bond_energy(network, trajectory).sum(-1)
 
 
@@ -60,6 +99,10 @@ def distances(network: Network, origin: int | Any) -> Tensor:
     Args:
         network: any.
         origin: a particle, counted from 1, or coordinates (dimension,).
+
+    Example:
+        >>> tc.network.distances(tc.lattice("square", (3, 3)), origin=1).round(decimals=3).tolist()[:3]  # across the box
+        [0.0, 1.0, 1.0]
     """
     if isinstance(origin, int) and not isinstance(origin, bool):
         point = network.positions[checks.integer("origin", origin, 1, network.n_particles) - 1]
@@ -82,17 +125,36 @@ def energy_radius(network: Network, energy: Tensor, origin: int | Any) -> Tensor
 
     Raises:
         FieldError: if the total energy of a state is not positive.
+
+    Example:
+        >>> sheet, energy = tc.lattice("square", (5, 5)), torch.zeros(1, 25, dtype=torch.float64)
+        >>> energy[0, 1] = 1.0  # all in the neighbor of particle 1
+        >>> tc.network.energy_radius(sheet, energy, origin=1).tolist()
+        [1.0]
     """
     return _share(energy) @ distances(network, origin)
 
 
 def energy_spread(network: Network, energy: Tensor, origin: int | Any) -> Tensor:
-    """Mean squared distance of the energy from a point, r^2(t), (*batch, time); arguments as :func:`energy_radius`."""
+    """Mean squared distance of the energy from a point, r^2(t), (*batch, time); arguments as :func:`energy_radius`.
+
+    Example:
+        >>> sheet, energy = tc.lattice("square", (5, 5)), torch.zeros(1, 25, dtype=torch.float64)
+        >>> energy[0, 2] = 1.0  # two spacings from particle 1
+        >>> tc.network.energy_spread(sheet, energy, origin=1).tolist()
+        [4.0]
+    """
     return _share(energy) @ distances(network, origin).square()
 
 
 def energy_front(network: Network, energy: Tensor, origin: int | Any, share: float = 0.99) -> Tensor:
-    """Radius about a point that holds this share of the energy, (*batch, time); arguments as :func:`energy_radius`."""
+    """Radius about a point that holds this share of the energy, (*batch, time); arguments as :func:`energy_radius`.
+
+    Example:
+        >>> sheet = tc.lattice("square", (5, 5))
+        >>> tc.network.energy_front(sheet, torch.ones(1, 25, dtype=torch.float64), origin=1, share=0.5).shape
+        torch.Size([1])
+    """
     share = checks.number("share", share, above=0, at_most=1)
     far, order = distances(network, origin).sort()
     held = _share(energy)[..., order].cumsum(-1)
@@ -108,6 +170,11 @@ def radial_profile(network: Network, energy: Tensor, origin: int | Any, edges: A
         energy: per particle, (*batch, time, particle).
         origin: a particle, counted from 1, or coordinates (dimension,).
         edges: radii, ascending; ring r holds edges[r] <= distance < edges[r + 1].
+
+    Example:
+        >>> sheet = tc.lattice("square", (5, 5))
+        >>> tc.network.radial_profile(sheet, torch.ones(1, 25, dtype=torch.float64), origin=1, edges=[0.0, 0.5, 1.2, 9.0]).tolist()
+        [[1.0, 4.0, 20.0]]
     """
     edges = checks.real_tensor("edges", edges).to(energy)
     if edges.ndim != 1 or len(edges) < 2 or bool((edges.diff() <= 0).any()):

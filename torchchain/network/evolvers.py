@@ -46,7 +46,20 @@ def evolve(network: Network, state: State, times: Any, method: str = "modes", **
 
 
 def begin(network: Network, state: State, method: str, **options: Any) -> Advance:
-    """The start of an evolution whose times come in windows."""
+    """The start of an evolution whose times come in windows.
+
+    Args:
+        network, state, method, options: as for :func:`evolve`.
+
+    Returns:
+        A function of increasing windows of times (time,), which gives their NetworkTrajectory.
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (4, 4))
+        >>> advance = tc.network.begin(sheet, tc.network.plane_wave(sheet, (1, 0)), "modes")
+        >>> tuple(advance(torch.tensor([0.0, 1.0], dtype=torch.float64)).velocity.shape)
+        (2, 16, 2)
+    """
     checks.instance("network", network, Network)
     checks.instance("state", state, State)
     entry = METHODS[checks.choice("method", method, METHODS)]

@@ -49,6 +49,11 @@ class Lattice(Network):
         boundary: "periodic", "fixed" or "free" along each.
         steps: of every bond, (bond,): from its first end to the second by step s of ``STEPS`` for s < n, by its
             opposite for n + s, n being the number of steps.
+
+    Example:
+        >>> sheet = tc.lattice("square", (4, 6), motion="scalar")
+        >>> sheet.kind, sheet.shape, sheet.is_periodic
+        ('square', (4, 6), True)
     """
 
     kind: str = field(default="square", kw_only=True)
@@ -230,6 +235,11 @@ def dispersion(network: Lattice, wavevectors: Tensor) -> Tensor:
 
     Raises:
         FieldError: for a lattice with unequal bonds.
+
+    Example:
+        >>> sheet = tc.lattice("square", (8, 8), motion="scalar")
+        >>> tc.network.dispersion(sheet, torch.tensor([[torch.pi, 0.0]], dtype=torch.float64)).round(decimals=6).tolist()
+        [[2.0]]
     """
     if not network.is_uniform:
         raise checks.fail("network", "be a periodic lattice of equal bonds for a dispersion relation", network.kind)

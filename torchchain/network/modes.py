@@ -21,11 +21,26 @@ MOST_FACTORED = 10**6  # unknowns up to which it is looked up in a sparse factor
 
 
 class FloppyWarning(UserWarning):
-    """A network with more zero modes than its rigid motions."""
+    """A network with more zero modes than its rigid motions.
+
+    Example:
+        >>> tc.network.softness(tc.lattice("square", (4, 4))).zero_modes  # what the warning of its modes counts
+        8
+    """
 
 
 class UnstableError(checks.FieldError):
-    """A network whose prestress makes a squared frequency negative."""
+    """A network whose prestress makes a squared frequency negative.
+
+    Example:
+        >>> x = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], dtype=torch.float64)
+        >>> pressed = tc.Network(torch.ones(3), x, [[0, 1], [1, 2]], tension=-0.5)  # a free row under pressure buckles
+        >>> try:
+        ...     tc.network.check_stability(pressed)
+        ... except tc.network.UnstableError as error:
+        ...     print(type(error).__name__)
+        UnstableError
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +50,11 @@ class NetworkModes:
     Attributes:
         frequencies: (*batch, mode), ascending; exactly zero for zero modes.
         shapes: (*batch, particle, component, mode), with unit modal mass: sum of m |s|^2 over the particles is 1.
+
+    Example:
+        >>> modes = tc.normal_modes(tc.lattice("triangular", (4, 4)))
+        >>> tuple(modes.shapes.shape), int(modes.n_zero)
+        ((16, 2, 32), 2)
     """
 
     frequencies: Tensor
@@ -55,6 +75,10 @@ class Softness:
         rigid: motions of the whole that no bond feels: translations, and rotations of what is free to turn.
         components: pieces not connected by bonds.
         rattlers: loose particles; see :func:`torchchain.network.rattlers`.
+
+    Example:
+        >>> tc.network.softness(tc.lattice("triangular", (4, 4))).floppy
+        0
     """
 
     zero_modes: int
@@ -166,7 +190,13 @@ def describe_softness(network: Network, zero_modes: int) -> Softness:
 
 
 def components(network: Network) -> Tensor:
-    """Number of the connected piece that each particle belongs to, counted from 0, (particle,); anchors are one body."""
+    """Number of the connected piece that each particle belongs to, counted from 0, (particle,); anchors are one body.
+
+    Example:
+        >>> x = torch.tensor([[0.0], [1.0], [5.0], [6.0]], dtype=torch.float64)
+        >>> tc.network.components(tc.Network(torch.ones(4), x, [[0, 1], [2, 3]])).tolist()
+        [0, 0, 1, 1]
+    """
     n = network.n_particles
     bonds = network.bonds.cpu().numpy()
     held = (torch.as_tensor(network.stiffness).detach() > 0).reshape(-1, network.n_bonds).any(0).cpu().numpy()
@@ -181,6 +211,11 @@ def rigid_motions(network: Network) -> int:
     """How many independent motions of the whole network change no bond: 0 if it is anchored.
 
     Translations, and rotations in the planes of two directions that are not periodic.
+
+    Example:
+        >>> x = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 0.8]], dtype=torch.float64)
+        >>> tc.network.rigid_motions(tc.Network(torch.ones(3), x, [[0, 1], [1, 2], [2, 0]]))  # two shifts and a turn
+        3
     """
     if network.n_anchors:
         return 0
@@ -211,6 +246,9 @@ def check_stability(network: Network) -> None:
 
     Raises:
         UnstableError: if a squared frequency lies below -1e-10 of the largest possible.
+
+    Example:
+        >>> tc.network.check_stability(tc.lattice("triangular", (4, 4)))
     """
     if network.motion == "scalar" or not bool((torch.as_tensor(network.tension).detach() < 0).any()):
         return

@@ -32,6 +32,12 @@ class Packing(Network):
         radii: (particle,).
         contact: "linear" or "hertz".
         modulus: kappa, one number for all contacts.
+
+    Example:
+        >>> x = torch.tensor([[0.0, 0.0], [0.9, 0.0]], dtype=torch.float64)
+        >>> pair = tc.packing(x, radii=torch.full((2,), 0.5), masses=torch.ones(2), contact="hertz")
+        >>> pair.overlaps.round(decimals=3).tolist()
+        [0.1]
     """
 
     radii: Tensor = field(default_factory=lambda: torch.zeros(0), kw_only=True)
@@ -168,6 +174,11 @@ def rattlers(network: Network) -> Tensor:
 
     A grain needs dimension + 1 contacts, at least, to be held by pushes alone; a particle of another network, whose
     bonds also pull, needs as many as dimensions, and one bond for motion "scalar".
+
+    Example:
+        >>> x = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 0.8], [5.0, 5.0]], dtype=torch.float64)
+        >>> tc.network.rattlers(tc.Network(torch.ones(4), x, [[0, 1], [1, 2], [2, 0]])).tolist()
+        [False, False, False, True]
     """
     n = network.n_particles
     need = network.n_components + (isinstance(network, Packing) and network.motion == "vector")
@@ -185,13 +196,25 @@ def rattlers(network: Network) -> Tensor:
 
 
 def without_rattlers(network: Network) -> Network:
-    """The network of the other particles and the bonds between them, renumbered in order."""
+    """The network of the other particles and the bonds between them, renumbered in order.
+
+    Example:
+        >>> x = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 0.8], [5.0, 5.0]], dtype=torch.float64)
+        >>> tc.network.without_rattlers(tc.Network(torch.ones(4), x, [[0, 1], [1, 2], [2, 0]])).n_particles
+        3
+    """
     keep = ~rattlers(network)
     return subnetwork(network, keep)
 
 
 def subnetwork(network: Network, keep: Tensor) -> Network:
-    """The network of the particles where ``keep`` (particle,) holds, renumbered in order; anchors stay."""
+    """The network of the particles where ``keep`` (particle,) holds, renumbered in order; anchors stay.
+
+    Example:
+        >>> sheet = tc.lattice("square", (4, 4))
+        >>> tc.network.subnetwork(sheet, torch.arange(16) < 8).n_particles
+        8
+    """
     n, device = network.n_particles, network.bonds.device
     if keep.dtype != torch.bool or tuple(keep.shape) != (n,):
         raise checks.fail("keep", f"be truth values of shape ({n},)", f"{keep.dtype}, shape {tuple(keep.shape)}")

@@ -35,6 +35,11 @@ class Spectrum:
         frequencies: w, (frequency,).
         density: per unit of w, (*any, frequency); its integral over all w is 1.
         stderr: of the density over random starts, or None.
+
+    Example:
+        >>> found = tc.network.density_of_states(tc.lattice("square", (16, 16), motion="scalar"), torch.linspace(0.01, 2.9, 300))
+        >>> abs(torch.trapezoid(found.density, found.frequencies).item() - 1) < 0.05
+        True
     """
 
     frequencies: Tensor
@@ -52,6 +57,12 @@ def spectral_moments(network: Network, starts: Tensor, n_moments: int) -> tuple[
 
     Returns:
         mu_k, (start, moment), and W, at least the highest frequency.
+
+    Example:
+        >>> sheet = tc.lattice("square", (8, 8), motion="scalar")
+        >>> moments, top = tc.network.spectral_moments(sheet, torch.randn(2, 64, 1, dtype=torch.float64), 16)
+        >>> tuple(moments.shape), top >= 8**0.5
+        ((2, 16), True)
     """
     if network.batch_shape:
         raise checks.fail(
@@ -119,6 +130,15 @@ def density_from_moments(moments: Tensor, top: float, frequencies: Tensor) -> Te
         moments: (*any, moment).
         top: W.
         frequencies: (frequency,).
+
+    Returns:
+        (*any, frequency), per unit of w.
+
+    Example:
+        >>> sheet = tc.lattice("square", (8, 8), motion="scalar")
+        >>> moments, top = tc.network.spectral_moments(sheet, torch.randn(2, 64, 1, dtype=torch.float64), 64)
+        >>> tuple(tc.network.density_from_moments(moments, top, torch.linspace(0.1, 2.8, 50)).shape)
+        (2, 50)
     """
     n = moments.shape[-1]
     k = torch.arange(n, dtype=torch.float64)
@@ -145,6 +165,14 @@ def density_of_states(
         n_moments: the resolution is pi W / n_moments in the middle of the spectrum and finer, to its square, at w = 0.
         n_starts: random vectors whose mean stands for the trace; its error falls as 1 / sqrt(n_starts n_unknowns).
         seed: of the starts.
+
+    Returns:
+        Spectrum with density and stderr (frequency,).
+
+    Example:
+        >>> found = tc.network.density_of_states(tc.lattice("square", (16, 16), motion="scalar"), [1.0, 5.0])
+        >>> found.density[0].item() > 0, found.density[1].item()
+        (True, 0.0)
     """
     frequencies = checks.real_tensor("frequencies", frequencies)
     n_starts = checks.integer("n_starts", n_starts, 1)
@@ -176,6 +204,12 @@ def structure_factor(
 
     Returns:
         Spectrum with density (wavevector, frequency), the mean of both phases of the wave.
+
+    Example:
+        >>> sheet, w = tc.lattice("square", (16, 16), motion="scalar"), torch.linspace(0.1, 2.9, 281)
+        >>> found = tc.network.structure_factor(sheet, [[4, 0]], w, polarization="scalar")
+        >>> round(w[found.density[0].argmax()].item(), 1)  # 2 sin(q / 2) at q = pi / 2
+        1.4
     """
     frequencies = checks.real_tensor("frequencies", frequencies)
     waves: list[Tensor] = []
@@ -214,6 +248,11 @@ def ordered_density(network: Lattice, edges: Any, points: int = 800) -> Tensor:
         network: a periodic lattice of equal bonds; its shape does not matter.
         edges: of the bins of w, ascending, (bin + 1,).
         points: of the grid along each direction.
+
+    Example:
+        >>> density = tc.network.ordered_density(tc.lattice("square", (8, 8), motion="scalar"), torch.linspace(0, 3, 31), points=200)
+        >>> round(density.sum().item() * 0.1, 3)
+        1.0
     """
     if not network.is_uniform:
         raise checks.fail(
@@ -247,6 +286,14 @@ def born_rate(network: Lattice, frequencies: Any, strength: float, width: float 
         strength: xi, the standard deviation of the masses over their mean.
         width: over which g is averaged.
         points: of the grid behind g; see :func:`ordered_density`.
+
+    Returns:
+        (frequency,), per unit time.
+
+    Example:
+        >>> rate = tc.network.born_rate(tc.lattice("square", (8, 8), motion="scalar"), [0.5, 1.0], strength=0.1, points=200)
+        >>> rate.diff().gt(0).tolist()  # short waves are scattered sooner
+        [True]
     """
     frequencies = checks.real_tensor("frequencies", frequencies).double()
     strength = checks.number("strength", strength, at_least=0)

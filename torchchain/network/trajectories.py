@@ -15,7 +15,19 @@ from torchchain.network.networks import Network
 
 @dataclass(frozen=True, eq=False)
 class NetworkTrajectory(Trajectory):
-    """States of networks in time: displacement and velocity (*batch, *any, time, particle, component)."""
+    """States of networks in time: displacement and velocity (*batch, *any, time, particle, component).
+
+    Attributes:
+        times: (time,).
+        dissipated: energy lost to damping since time 0, (*batch, *any, time); None if undamped.
+        openings: contacts open up to each time, (*batch, *any, time); None for linear contacts.
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (4, 4))
+        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0, 1.0], method="modes")
+        >>> tuple(path.displacement.shape)
+        (2, 16, 2)
+    """
 
     axes_of_a_state: ClassVar[tuple[str, ...]] = ("particle", "component")
 

@@ -176,6 +176,15 @@ def grain_energy(network: Packing, trajectory: NetworkTrajectory) -> Tensor:
 
     Returns:
         (*batch, time).
+
+    Example:
+        >>> x = torch.tensor([[0.0, 0.0], [0.9, 0.0], [0.0, 0.9], [0.9, 0.9]], dtype=torch.float64)
+        >>> grains = tc.packing(x, torch.full((4,), 0.5), torch.ones(4), box=torch.tensor([1.8, 1.8]), contact="hertz")
+        >>> kick = tc.State(torch.zeros(4, 2, dtype=torch.float64), torch.zeros(4, 2, dtype=torch.float64))
+        >>> kick.velocity[0, 0] = 0.01
+        >>> path = tc.evolve(grains, kick, [0.0], method="verlet", step=0.01)
+        >>> f"{tc.network.grain_energy(grains, path)[0].item():.1e}"
+        '5.0e-05'
     """
 
     def stored(length: Tensor) -> Tensor:

@@ -31,6 +31,11 @@ class Zone:
         longitudinal: projector on the direction of q, (wavevector, dimension, dimension); on the boundary the mean over
             the equivalent wavevectors, at q = 0 a multiple of one.
         is_edge: whether q has an equivalent of the same length, (wavevector,).
+
+    Example:
+        >>> found = tc.network.zone(tc.lattice("triangular", (4, 4)))
+        >>> tuple(found.wavevectors.shape), round(found.lengths.max().item(), 3)
+        ((16, 2), 3.628)
     """
 
     turns: Tensor
@@ -41,7 +46,12 @@ class Zone:
 
 
 def zone(network: Lattice) -> Zone:
-    """The wavevectors of a periodic lattice."""
+    """The wavevectors of a periodic lattice.
+
+    Example:
+        >>> tc.network.zone(tc.lattice("square", (4, 4))).lengths[:3].round(decimals=4).tolist()
+        [0.0, 1.5708, 3.1416]
+    """
     checks.instance("network", network, Lattice)
     if not network.is_periodic:
         raise checks.fail("boundary", "be periodic for wavevectors of a lattice", network.boundary)
@@ -75,7 +85,14 @@ def zone(network: Lattice) -> Zone:
 
 
 def transform(network: Lattice, field: Tensor) -> Tensor:
-    """Unitary discrete Fourier transform over the lattice, (*any, particle, component) to (*any, wavevector, component)."""
+    """Unitary discrete Fourier transform over the lattice, (*any, particle, component) to (*any, wavevector, component).
+
+    Example:
+        >>> sheet = tc.lattice("square", (4, 4), motion="scalar")
+        >>> field = torch.ones(16, 1, dtype=torch.float64)
+        >>> tc.network.transform(sheet, field).abs().flatten().round(decimals=6).tolist()[:3]  # all at q = 0
+        [4.0, 0.0, 0.0]
+    """
     axes = tuple(range(-network.dimension - 1, -1))
     return torch.fft.fftn(field.unflatten(-2, network.shape), dim=axes, norm="ortho").flatten(axes[0], -2)
 
@@ -91,6 +108,13 @@ def wavenumber_energy(network: Lattice, trajectory: Trajectory) -> Tensor:
     Args:
         network: a periodic lattice; masses and bonds may be disordered.
         trajectory: displacement and velocity (*batch, time, particle, component).
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (8, 8))
+        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0], method="modes")
+        >>> energy = tc.network.wavenumber_energy(sheet, path)
+        >>> tuple(energy.shape), torch.allclose(energy.sum((-2, -1)), tc.network.total_energy(sheet, path))
+        ((1, 64, 2), True)
     """
     displacement, velocity = check_trajectory(network, trajectory)
     where = zone(network)
@@ -118,6 +142,13 @@ class PlaneWaveEnergy:
         wavevectors: (wavevector, dimension), q and -q as one, ascending in length; q = 0 first.
         energy: (*batch, time, wavevector, polarization).
         remainder: energy in none of the waves, (*batch, time); with it the sum is the total.
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (8, 8))
+        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0], method="modes")
+        >>> found = tc.network.plane_wave_energy(sheet, path, largest=2.0)
+        >>> (found.remainder.abs() < 1e-9 * found.energy.sum()).item()  # one long wave is all there is
+        True
     """
 
     wavevectors: Tensor
@@ -134,6 +165,14 @@ def box_wavevectors(network: Network, largest: float) -> Tensor:
 
     Raises:
         FieldError: for a network without a box that is periodic along every direction.
+
+    Args:
+        network: in a box that is periodic along every direction.
+        largest: |q| of the last one.
+
+    Example:
+        >>> tc.network.box_wavevectors(tc.lattice("square", (8, 8)), largest=0.8).shape
+        torch.Size([3, 2])
     """
     largest = checks.number("largest wavenumber", largest, at_least=0)
     if network.cell is None:
@@ -204,6 +243,16 @@ def plane_wave_energy(network: Network, trajectory: Trajectory, largest: float) 
         network: periodic along every direction.
         trajectory: displacement and velocity (*batch, time, particle, component).
         largest: |q| of the last wavevector.
+
+    Returns:
+        PlaneWaveEnergy.
+
+    Example:
+        >>> sheet = tc.lattice("triangular", (8, 8))
+        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0], method="modes")
+        >>> found = tc.network.plane_wave_energy(sheet, path, largest=2.0)
+        >>> tuple(found.wavevectors.shape), tuple(found.energy.shape)
+        ((10, 2), (1, 10, 2))
     """
     displacement, velocity = check_trajectory(network, trajectory)
     wavevectors = box_wavevectors(network, largest)
@@ -238,6 +287,11 @@ def shell_energy(lengths: Tensor, energy: Tensor, edges: Any) -> Tensor:
         lengths: |q|, (wavevector,).
         energy: (*batch, time, wavevector, polarization).
         edges: ascending; shell s holds edges[s] < |q| <= edges[s + 1].
+
+    Example:
+        >>> energy = torch.ones(1, 3, 1)  # one instant, three wavevectors, one polarization
+        >>> tc.network.shell_energy(torch.tensor([0.0, 0.5, 1.0]), energy, edges=[0.0, 0.7, 1.4]).flatten().tolist()
+        [1.0, 1.0]
     """
     edges = checks.real_tensor("edges", edges).to(energy)
     shell = torch.bucketize(lengths.to(energy) * (1 - 1e-12), edges)

@@ -31,6 +31,11 @@ class DisorderFit:
         damping, damping_stderr: contact damping; 0 and 0 where it was not fitted.
         misfit: root mean square of the residuals over their expected size, 1 for a fit within the errors.
         evaluations: transfers computed.
+
+    Example:
+        >>> found = tc.theory.DisorderFit(0.21, 0.02, 0.0, 0.0, misfit=1.0, evaluations=12)
+        >>> abs(found.strength - 0.2) < found.strength_stderr
+        True
     """
 
     strength: float

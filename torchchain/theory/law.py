@@ -24,6 +24,11 @@ class Law:
     Attributes:
         values: positive.
         weights: positive, of sum 1.
+
+    Example:
+        >>> law = tc.theory.law_of(tc.Disorder(strength=0.3))
+        >>> abs((law.weights * law.values).sum().item() - 1) < 0.01
+        True
     """
 
     values: Tensor

@@ -71,6 +71,10 @@ class Return:
 
     Attributes:
         narrowing, onset, delay, power: pure numbers.
+
+    Example:
+        >>> tc.theory.Return(onset=2.0).onset  # in place of the measured one
+        2.0
     """
 
     narrowing: float = 1.2

@@ -36,6 +36,11 @@ class TheoryTransfer:
         long_time_systematic: of ``long_time``, (source,).
         settings: the grids that were chosen: edge of the spectrum, frequencies and damping of the contour a stretch of
             times; ``closure``, the largest defect of the energy sum before rows were scaled by it.
+
+    Example:
+        >>> found = tc.theory.theory_transfer(tc.Disorder(strength=0.3), n_particles=64, n_bands=8, times=[0.0, 10.0])
+        >>> tuple(found.mean.shape), tuple(found.systematic.shape), tuple(found.long_time.shape)
+        ((8, 2, 8), (8, 2), (8, 8))
     """
 
     times: Tensor
