@@ -137,9 +137,9 @@ def certify(model: TransferModel) -> Certificate:
         A certificate, which ``holds`` or not. ``lower`` is a bound in either case, close where it holds.
 
     Example:
-        >>> certificate = certify(nonnegative(model))
-        >>> certificate.holds, certificate.drift < 1e-12
-        (True, True)
+        >>> rates = torch.tensor([[-0.3, 0.3], [0.1, -0.1]], dtype=torch.float64)
+        >>> certify(tc.RateModel(rates, torch.zeros(2))).holds
+        True
     """
     checks.instance("model", model, TransferModel)
     given = getattr(model, "certificate", None)
@@ -282,13 +282,13 @@ class Space:
 
 def nonnegative(
     model: MemoryModel, times: Tensor, mean: Tensor | None = None, distance: Tensor | None = None
-) -> MemoryModel:
+) -> tuple[MemoryModel, Certificate]:
     """The nearest model with the same poles whose energies are never negative, and which starts as exactly as a chain.
 
     Weighted least squares for the amplitudes under T(t) >= 0 at every t, T(t) = I + O(t^4) and row sums of 1: convex, by
     cutting planes. Each round adds the deepest negative energies to the constraints; the dual problem is one of
     nonnegative least squares (Lawson and Hanson 1974). Functions for the first collisions, EARLY_PAIRS, are added to the
-    model's poles. Deterministic; the result passes :func:`certify`.
+    model's poles. Deterministic.
 
     Args:
         model: its poles, basis Pi and damping are kept.
@@ -296,6 +296,9 @@ def nonnegative(
         mean: T that is fitted, [source, time, receiver]; None for the model's own.
         distance: expected total variation of two ensembles at each time, (time,), whose inverse is the weight of a time; None
             to count each time relative to how far energy has moved by then.
+
+    Returns:
+        The model and its certificate, which holds.
 
     Raises:
         CertificateError: if no such model was found, with the lowest energy of the best.
@@ -350,7 +353,7 @@ def nonnegative(
                 continue
             certificate = certify(found)
             if certificate.holds:
-                return found
+                return found, certificate
             lowest = max(lowest, certificate.lower)
     raise CertificateError(f"model must have no negative energy, got {lowest:.3g} at best")
 

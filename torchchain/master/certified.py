@@ -16,7 +16,7 @@ from torchchain.master.memory import ORDERS, MemoryModel, ProjectionReport
 from torchchain.master.model import TransferModel
 from torchchain.master.proof import Certificate
 from torchchain.master.records import Fitted, Progress, Recipe
-from torchchain.master.sample import Sample
+from torchchain.master.sample import Sample, decade_weights
 
 AS_GOOD = 1.05
 """Distance from the ensemble of a model that is never negative, relative to the free fit's, up to which it replaces it."""
@@ -47,16 +47,16 @@ def certified(
     """
     model, told = free
     far = _distance(model, transfer)
-    proof = certify(model)
     nearest: tuple[float, TransferModel, ProjectionReport, Certificate] | None = None
-    for other, report in _found(transfer, asked, free) if mend else ():
+    for other, report, proof in _found(transfer, asked, free) if mend else ():
         off = _distance(other, transfer)
         if progress is not None:
             progress(1)
         if nearest is None or off < nearest[0]:
-            nearest = (off, other, report, certify(other))
+            nearest = (off, other, report, proof)
         if off <= AS_GOOD * far:
             return nearest[1:]
+    proof = certify(model)
     if proof.holds:
         return model, told, proof
     low, high = min(0.0, float(transfer.mean.min())), max(1.0, float(transfer.mean.max()))  # imported data may be wild
@@ -72,17 +72,20 @@ def certified(
     return model, told, None
 
 
-def _found(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitted]:
-    """Models that are never negative, with the decay rates of the free fit and of fits of smaller orders."""
+def _found(
+    transfer: BandTransfer, asked: Recipe, free: Fitted
+) -> Iterator[tuple[TransferModel, ProjectionReport, Certificate]]:
+    """Models that are never negative, with the decay rates of the free fit and of fits of smaller orders, and the proof."""
     noise = Sample.of(transfer).distance
     if transfer.n_bands == 1:  # it keeps all its energy: nothing decays that could be mended
         return
     for model, told in _fits(transfer, asked, free):
         assert isinstance(model, MemoryModel), "of the method 'projection'"
         try:
-            yield nonnegative(model, transfer.times, transfer.mean, noise), told
+            found, proof = nonnegative(model, transfer.times, transfer.mean, noise)
         except CertificateError:
             continue
+        yield found, told, proof
 
 
 def _fits(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitted]:
@@ -95,6 +98,7 @@ def _fits(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitte
 
 
 def _distance(model: TransferModel, transfer: BandTransfer) -> float:
-    used = transfer.times > 0
+    """Total variation from the ensemble, each decade of time counting alike."""
     with torch.no_grad():
-        return float(total_variation(model.transfer(transfer.times), transfer.mean)[:, used].mean())
+        off = total_variation(model.transfer(transfer.times), transfer.mean).mean(0)
+    return float(off @ decade_weights(transfer.times))

@@ -38,7 +38,7 @@ from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedMode
 from torchchain.master.sample import Sample, block_weights
 from torchchain.threads import single_blas_thread
 
-LADDER = ((4, 3, 6), (6, 4, 8), (8, 5, 10), (8, 6, 12), (10, 7, 14), (12, 8, 16))
+LADDER = ((4, 3, 6), (6, 4, 8), (8, 5, 10), (8, 6, 12), (10, 7, 20), (14, 10, 20))
 """Degrees in place, distance and time that are tried one after the other."""
 CLOCK = 10.0
 """t0 of the clock tau."""
@@ -47,9 +47,11 @@ FLOOR = 0.05
 LARGEST_EXPONENT = 60.0
 TONES = 8
 """Tones of a receiving band that are summed over; of more, as many spread evenly."""
-RIDGE = 10.0
+RIDGE = 1.0
 """Against coefficients that the data do not tell, which would run away between the strengths of a family."""
 FIT_TIMES = 48
+BEYOND = (1.5, 2.5, 5.0, 10.0, 30.0, 100.0, 1000.0)
+"""Times after the last, in units of it, at which what has not settled is to have come nearer to Pi."""
 SERIES = 0.1
 """Up to this time D is summed in powers of t, beyond as it stands: differences of cosines lose digits at first."""
 SERIES_ORDER = 14
@@ -291,7 +293,7 @@ class CompactModel(TransferModel):
         for smaller in (order, *(known for known in ORDERS[::-1] if sum(known) < sum(order))):
             tensors, _ = fit_memory(times, mean, basis, smaller)
             try:
-                return nonnegative(MemoryModel(rates=self.rates, **tensors), times, mean)
+                return nonnegative(MemoryModel(rates=self.rates, **tensors), times, mean)[0]
             except CertificateError as error:
                 reason = error
         raise reason
@@ -575,9 +577,13 @@ def regression(
     spread = spread.clamp(min=max(1e-5 * float(spread.max()), 1e-300))
     times, data = times[picked], mean[:, picked]
     if long_time is not None:
-        times = torch.cat([times, times.new_full((1,), math.inf)])
-        data = torch.cat([data, long_time.double()[:, None]], dim=1)
-        spread = torch.cat([spread, spread[-1:] * 0.7])
+        # of what has not settled by the end, a share of 1 / t may be left: no time beyond the data is without a tie
+        left = float((data[:, -1] - long_time).abs().sum(-1).mean()) / 2
+        later = times.new_tensor([*BEYOND, math.inf])
+        late = (0.7 * spread[-1]).square() + (left / later).square()
+        times = torch.cat([times, times[-1] * later])
+        data = torch.cat([data, long_time.double()[:, None].expand(-1, len(later), -1)], dim=1)
+        spread = torch.cat([spread, late.sqrt()])
     # a time's error in each energy, from the total variation: B energies of error sigma are sigma B / sqrt(pi) apart
     weight = len(mean) / math.sqrt(math.pi) / spread.numpy()
     return Regression.of(waves, degrees, times, data, weight)
@@ -761,11 +767,10 @@ def replicas(transfer: BandTransfer, recipe: Recipe, model: CompactModel, repeat
     )
     weights, picked = block_weights(transfer, repeats), chosen_times(sample.times)
     means = torch.einsum("ab,bstr->astr", weights, transfer.block_mean[:, :, picked])
-    if transfer.block_long_time is not None:
-        late = torch.einsum("ab,bsr->asr", weights, transfer.block_long_time)
-        means = torch.cat([means, late[:, :, None]], dim=2)
-    elif sample.long_time is not None:
-        means = torch.cat([means, sample.long_time[:, None].expand(len(means), -1, -1, -1)], dim=2)
+    late = transfer.block_long_time
+    if late is not None:
+        ends = torch.einsum("ab,bsr->asr", weights, late)[:, :, None].expand(-1, -1, len(BEYOND) + 1, -1)
+        means = torch.cat([means, ends], dim=2)
     slope = linear_weights(sample.times, recipe.window)
     rates = torch.einsum("ab,bsr->asr", weights, torch.einsum("t,bstr->bsr", slope, transfer.block_mean))
     with single_blas_thread():
@@ -783,5 +788,5 @@ COMPACT = ReducedModel(
     "compact", "odds of damped beats times exponentials of polynomials: a few hundred numbers, never negative", CompactModel,
     (Fit("logistic", "logistic regression on all times", _fit, settings=CompactSettings, report=CompactReport),),
     lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="logistic", default=True,
-    needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_scene, named_only=True, windows=(1.0, 5.0), replicas=replicas,
+    needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_scene, windows=(1.0, 5.0, 50.0), replicas=replicas,
 )  # fmt: skip

@@ -257,8 +257,9 @@ class MasterEquation(Printed, nn.Module):
     def concerns(self, scene: Scene) -> list[str]:
         """What of a scene this model was not calibrated for, in words; empty if nothing.
 
-        Bands and boundary cannot be changed afterwards; disorder within 1e-9 only, unless the model is one of a range of
-        strengths. The chain's length may change where the wave has not yet gone round: the rates belong to bands, not to tones.
+        All of the scene is compared that changes energies, the disorder's strength to 1e-9. The chain's length may change
+        where the wave has not yet gone round: bands are those of wavenumber, and a tone belongs at its place in its band.
+        Seed, realizations, tolerance and observables do not matter, nor do times and tones that were left out.
         """
         checks.instance("scene", scene, Scene)
         own = self.calibration.scene
@@ -269,19 +270,22 @@ class MasterEquation(Printed, nn.Module):
             found.append(f"times to {end:g}, compared with chains to {self.horizon:g}")
         if own is None:
             return [*found, "chains that are described, where its own energies came without a scene"]
-        for name in ("boundary", "damping", "contact"):
+        for name in ("boundary", "damping", "contact", "energy_definition"):
             if getattr(scene, name) != getattr(own, name):
                 found.append(f"{name} {getattr(scene, name)}, calibrated on {getattr(own, name)}")
-        if scene.disorder.kind != own.disorder.kind or scene.stiffness_disorder != own.stiffness_disorder:
+        masses = (scene.disorder.kind, own.disorder.kind)
+        if masses[0] != masses[1] or scene.stiffness_disorder != own.stiffness_disorder:
             found.append("another kind of disorder")
-        if abs(scene.disorder.strength - own.disorder.strength) > 1e-9:
-            found.append(f"disorder {scene.disorder.strength:g}, calibrated on {own.disorder.strength:g}")
+        for name in ("strength", "lower"):
+            here, there = (float(getattr(other.disorder, name)) for other in (scene, own))
+            if abs(here - there) > 1e-9:
+                found.append(f"disorder {name} {here:g}, calibrated on {there:g}".replace(" strength", ""))
         shorter = min(scene.n_particles, own.n_particles)
         if scene.n_particles != own.n_particles and end > shorter:
             found.append(
                 f"{scene.n_particles} particles, calibrated on {own.n_particles}, and waves that go round by t = {shorter}"
             )
-        return found
+        return [*found, *_other_start(scene, own)]
 
     def coarsened(self, n_bands: int) -> MasterEquation:
         """The model of fewer and wider bands, each of several of the present ones, for energy spread evenly in a band.
@@ -352,6 +356,29 @@ class MasterEquation(Printed, nn.Module):
             FieldError: naming the file and what is wrong with it.
         """
         return cls(*file.load(path))
+
+
+def _other_start(scene: Scene, own: Scene) -> list[str]:
+    """How the start of a scene differs from the standing waves of the calibration, in words."""
+    wave, known = scene.excitation, own.excitation
+    assert isinstance(known, StandingWave), "transfers come from standing waves"
+    if not isinstance(wave, StandingWave):
+        return ["an impulse, calibrated on standing waves"]
+    found = []
+    if scene.contact != "linear" and wave.amplitude != known.amplitude:  # of linear chains it does not matter
+        found.append(f"amplitude {wave.amplitude:g}, calibrated on {known.amplitude:g}")
+    if wave.phase != known.phase and scene.boundary != "periodic":  # on a ring they are the same on average
+        found.append(f"phase {wave.phase}, calibrated on {known.phase}")
+    places = {round(_place(tone, own), 9) for tone in own.tones}
+    others = [tone for tone in scene.tones if round(_place(tone, scene), 9) not in places]
+    if others:
+        found.append(f"tone {others[0]} of {scene.n_particles} particles, no tone of the calibration")
+    return found
+
+
+def _place(tone: int, scene: Scene) -> float:
+    """Wavenumber of a tone, 1 for pi."""
+    return 2 * tone / scene.n_particles
 
 
 def _joined_scene(scene: Scene | None, n_bands: int) -> Scene | None:

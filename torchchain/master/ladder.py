@@ -8,11 +8,8 @@ exact_psi      Psi from the exact long-time average of the modes               B
 basis_matrix   basis energy of every pair of bands, Pi[s, r]                   2 B^2
 swing_in       rates that act some time after the energy came                  2 B^2 + 1
 memory         any response, as a few decay rates shared by all pairs          B^2 (1 + functions - 1) + their rates
-compact        odds of damped beats, corrected by polynomials; never negative  53 to 498, whatever B
+compact        odds of damped beats, corrected by polynomials; never negative  53 to 806, whatever B
 =============  ==============================================================  =======================================
-
-Selection tries "compact" only where it is named: between the data's end and infinite time it is not tied to anything, and
-it has no linear differential equation of its own.
 """
 
 from __future__ import annotations

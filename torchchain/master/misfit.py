@@ -10,6 +10,8 @@ from torchchain import checks
 
 TIMES, BANDS = 2, 2
 """Neighbors on either side over which the model's error is averaged."""
+ROUNDING = 1e-14
+"""Errors of a share of the energy that are none, at time 0 and just after."""
 
 
 def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, spread: Tensor) -> Tensor:
@@ -29,7 +31,8 @@ def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, spread: Tensor)
             raise checks.fail(name, f"have shape {tuple(predicted.shape)}", f"shape {tuple(value.shape)}")
     variance = stderr.square()
     noise = (variance - spread.square()).clamp(min=0)
-    unit = torch.where(variance > 0, variance, torch.ones_like(variance))
+    told = variance > ROUNDING**2
+    unit = torch.where(told, variance, torch.ones_like(variance))
     excess = ((predicted - mean).square() - noise) / unit
     own = torch.eye(len(mean), dtype=torch.bool, device=mean.device)[:, None].expand_as(mean)
     table = excess.diagonal(dim1=0, dim2=2)[None]  # [1, time, source]
@@ -41,4 +44,4 @@ def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, spread: Tensor)
     total = functional.avg_pool2d((excess * others)[:, None], size, 1, edge)[:, 0]
     count = functional.avg_pool2d(others[:, None], size, 1, edge)[:, 0]
     smooth = torch.where(own, kept[:, :, None], total / count.clamp(min=1e-12))
-    return (smooth.clamp(min=0) * unit).sqrt() * (variance > 0)
+    return (smooth.clamp(min=0) * unit).sqrt() * told

@@ -86,8 +86,7 @@ class ReducedModel:
         fits_loss: whether it describes the energy lost by damped chains itself; it needs no long-time average then.
         rungs: settings of ``climbed_by`` that selection tries, from the fewest fitted numbers up.
         check_scene: raises a FieldError for chains, or data without a scene (None), that it cannot describe.
-        named_only: whether selection tries it only where it is named.
-        windows: ends of windows of time; selection takes it only if it reaches the ensemble's error within each.
+        windows: ends of windows of time, in each of which selection holds it to the ensemble's error; none: on average.
         replicas: ``replicas(transfer, recipe, model, repeats)`` -> the models of ensembles in which the blocks are
             repeated, (replica, block), where that is quicker than to fit each from its energies.
 
@@ -111,7 +110,6 @@ class ReducedModel:
     fits_loss: bool = False
     rungs: Callable[[int], Sequence[Any]] = lambda n_times: (NoSettings(),)
     check_scene: Callable[[Scene | None], None] = lambda scene: None
-    named_only: bool = False
     windows: tuple[float, ...] = ()
     replicas: Callable[[BandTransfer, Recipe, Any, Tensor], Iterator[TransferModel]] | None = None
 

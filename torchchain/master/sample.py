@@ -103,6 +103,20 @@ def leading_vectors(data: np.ndarray, count: int = LEADING) -> np.ndarray:
     return vectors @ right[:count].T
 
 
+def decade_weights(times: Tensor) -> Tensor:
+    """Weight of every time in a mean over the logarithm of time, (time,): that of 0 is none, the sum 1.
+
+    However the times are spaced, a decade of them counts as much as another.
+    """
+    used = (times > 0).nonzero()[:, 0]
+    weight = torch.zeros_like(times)
+    if len(used) < 3:
+        weight[used] = 1 / max(len(used), 1)
+        return weight
+    weight[used] = torch.gradient(times[used].log())[0]
+    return weight / weight.sum()
+
+
 def block_weights(transfer: BandTransfer, repeats: Tensor) -> Tensor:
     """Weight of each block taken as often as told, (*batch, block); rows sum to 1."""
     weight = repeats.to(transfer.mean.dtype) * torch.tensor(transfer.block_counts, dtype=transfer.mean.dtype)

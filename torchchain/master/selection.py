@@ -15,10 +15,12 @@ from torchchain.master.ladder import MODELS
 from torchchain.master.model import TransferModel
 from torchchain.master.records import Progress, Recipe
 from torchchain.master.report import Rung, Selection
-from torchchain.master.sample import Sample, exact_basis
+from torchchain.master.sample import Sample, decade_weights, exact_basis
 
 ENOUGH = 1.05
 """Distance of a model that is as good as the ensemble, over that of two halves, which is itself uncertain by some per cent."""
+NEAR = 1.25
+"""Distance from fresh chains over that of two ensembles, up to which a model of fewer numbers will do in a window of time."""
 
 
 def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
@@ -33,7 +35,7 @@ def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
             continue
         if asked.model is not None:
             record.check_scene(transfer.scene)
-        elif record.named_only or not record.describes(transfer.scene):
+        elif not record.describes(transfer.scene):
             continue
         fit = record.fit(record.climbed_by)
         for settings in record.rungs(len(transfer.times)):
@@ -47,7 +49,9 @@ def select(
 ) -> tuple[Recipe, Selection, TransferModel | None]:
     """The first rung that, fitted on every other block, predicts the rest as well as the fitted blocks' means do.
 
-    As well: within 5 % in total variation, for some models in each of several windows of time. If none does, the nearest. Models with rates are tried with procedure L.
+    As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time is taken if,
+    fitted to all blocks, it is foreseen to be within NEAR times the noise in every one. If none is, the nearest is
+    taken. Models with rates are tried with procedure L.
 
     Returns:
         The recipe of the rung, what was tried, and the model fitted to half of the blocks.
@@ -55,28 +59,39 @@ def select(
     candidates = rungs(asked, transfer)
     blocks = len(transfer.block_counts)
     if blocks < 4:
-        return candidates[-1], Selection("largest: too few blocks of realizations to hold some out"), None
+        return _untested(candidates), Selection("largest: too few blocks of realizations to hold some out"), None
     even = (torch.arange(blocks) + 1) % 2
-    seen, held = Sample.of_blocks(transfer, even), Sample.of_blocks(transfer, 1 - even).mean
-    used = transfer.times > 0
-    halves = total_variation(seen.mean, held)
-    noise = float(halves[:, used].mean())
+    parts = Sample.of_blocks(transfer, even), Sample.of_blocks(transfer, 1 - even)
+    halves = total_variation(parts[0].mean, parts[1].mean).mean(0)
+    weight = decade_weights(transfer.times)
+    noise = float(halves @ weight)
     tried: list[Rung] = []
     models: list[TransferModel] = []
     enough = False
-    for candidate in candidates:
+
+    def fitted(recipe: Recipe, sample: Sample, near: TransferModel | None = None) -> tuple[TransferModel, Tensor]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FitWarning)
-            model, _ = candidate.run(seen, progress=progress)
-        missed = total_variation(model.transfer(transfer.times).detach(), held)
-        distance = float(missed[:, used].mean())
-        assert candidate.model is not None, "a rung names its model"
-        tried.append(Rung(candidate.model.name, candidate.order, distance))
+            model, _ = recipe.run(sample, near, progress)
+        return model, model.transfer(transfer.times).detach()
+
+    for candidate in candidates:
+        record = candidate.model
+        assert record is not None, "a rung names its model"
+        model, found = fitted(candidate, parts[0])
+        missed = total_variation(found, parts[1].mean).mean(0)
+        tried.append(Rung(record.name, candidate.order, float(missed @ weight)))
         models.append(model)
-        enough = all(
-            float(missed[:, window].mean()) <= ENOUGH * float(halves[:, window].mean())
-            for window in _windows(transfer.times, candidate.model.windows)
-        )
+        if not record.windows:
+            enough = tried[-1].distance <= ENOUGH * noise
+        elif foreseen(halves, missed, halves) @ weight <= NEAR:  # not sure to be too far off
+            _, other = fitted(candidate, parts[1], model)
+            back = total_variation(other, parts[0].mean).mean(0)
+            both, spread = (missed + back) / 2, total_variation(found, other).mean(0)
+            enough = all(
+                float(foreseen(*(part[window].mean() for part in (halves, both, spread)))) <= NEAR
+                for window in windows(transfer.times, record.windows)
+            )
         if enough:
             break
     best = len(tried) - 1 if enough else min(range(len(tried)), key=lambda i: tried[i].distance)
@@ -85,8 +100,28 @@ def select(
     return candidates[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best]
 
 
-def _windows(times: Tensor, ends: tuple[float, ...]) -> list[Tensor]:
-    """Times above 0: all of them, those up to each end, and those after the last; windows without times are left out."""
-    used = times > 0
-    found = [used, *(used & (times <= end) for end in ends), *(times > end for end in ends[-1:])]
+def foreseen(halves: Tensor, missed: Tensor, spread: Tensor) -> Tensor:
+    """Distance of a model of all blocks from fresh chains, over that of two ensembles.
+
+    Errors add in squares: the held-out half is missed by the model's own error, by that of the blocks that it was fitted
+    to, and by the half's own; the latter two are half as large, squared, in twice the chains.
+
+    Args:
+        halves: distance of the two halves of the ensemble.
+        missed: of a model of one half from the other half.
+        spread: of the models of either half.
+    """
+    squared = halves.square()
+    return ((missed.square() - (squared + spread.square()) / 4).clamp(min=0) / (squared / 2).clamp(min=1e-300)).sqrt()
+
+
+def _untested(candidates: list[Recipe]) -> Recipe:
+    """The last of those without windows, that none has to be tested in; else the last."""
+    plain = [candidate for candidate in candidates if candidate.model is None or not candidate.model.windows]
+    return (plain or candidates)[-1]
+
+
+def windows(times: Tensor, ends: tuple[float, ...]) -> list[Tensor]:
+    """Times above 0 up to each end, and those after the last; windows without times are left out."""
+    found = [*((times > 0) & (times <= end) for end in ends), *(times > end for end in ends[-1:])]
     return [window for window in found if bool(window.any())]

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain.excitation import StandingWave
 from torchchain.energy.bands import band_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.plan import ARTIFACT, Choice, Plan, statistical_error
@@ -26,8 +25,6 @@ def missing(master: MasterEquation, scene: Scene) -> list[str]:
     other = [name for name in scene.observables if name not in PREDICTED]
     if other:
         found.append(f"{', '.join(other)}, where it predicts energies of bands")
-    if not isinstance(scene.excitation, StandingWave):
-        found.append("an impulse, calibrated on standing waves")
     return found
 
 

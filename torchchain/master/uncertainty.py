@@ -21,14 +21,15 @@ from torchchain import checks
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import FitWarning
+from torchchain.master.misfit import model_error
 from torchchain.master.model import TransferModel
 from torchchain.master.records import Progress, Recipe
 from torchchain.master.sample import Sample
 
 MOST_TIMES = 64
 """Times at which the errors of predictions are kept."""
-SMOOTHING = 2
-"""Neighbors on either side, in time and in receiving band, over which the model's own error is averaged."""
+AHEAD = 1e4
+"""Times beyond the last at which a model is looked at before it is trusted for good, up to so many times that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,7 @@ def draw_again(
     blocks = len(transfer.block_counts)
     draws = np.random.Generator(np.random.Philox(key=np.array([blocks, replicates], dtype=np.uint64)))
     drawn = [np.bincount(draws.integers(0, blocks, blocks), minlength=blocks) for _ in range(replicates)]
-    kept = _kept(len(transfer.times))
+    kept = _kept(transfer.times)
     times = transfer.times[kept]
     rates, bases, paths = [], [], []
     for other in _replicas(transfer, recipe, model, torch.from_numpy(np.stack(drawn))):
@@ -143,12 +144,13 @@ def draw_again(
     # blocks drawn with replacement spread (blocks - 1) / blocks of what independent ensembles do
     scale = math.sqrt(blocks / (blocks - 1))
     spread = scale * torch.stack(paths).std(0)
-    missed = ((chosen or model).transfer(times).detach() - transfer.mean[:, kept]).square()
-    noise = (transfer.stderr[:, kept].square() - spread.square()).clamp(min=0)
-    own = _smooth(missed - noise).clamp(min=0)
-    return Uncertainty(
-        scale * torch.stack(rates).std(0), scale * torch.stack(bases).std(0), times, (spread.square() + own).sqrt()
+    own = model_error(
+        (chosen or model).transfer(times).detach(), transfer.mean[:, kept], transfer.stderr[:, kept], spread
     )
+    return Uncertainty(
+        scale * torch.stack(rates).std(0), scale * torch.stack(bases).std(0), times,
+        (spread.square() + own.square()).sqrt(),
+    )  # fmt: skip
 
 
 def _replicas(transfer: BandTransfer, recipe: Recipe, model: TransferModel, repeats: Tensor) -> Iterator[TransferModel]:
@@ -163,25 +165,23 @@ def _replicas(transfer: BandTransfer, recipe: Recipe, model: TransferModel, repe
         yield other
 
 
-def _kept(count: int) -> Tensor:
-    """Indices of at most MOST_TIMES of the times, first and last among them."""
-    return torch.linspace(0, count - 1, min(count, MOST_TIMES), dtype=torch.float64).round().long().unique()
-
-
-def _smooth(values: Tensor) -> Tensor:
-    """Moving average over times and receivers, [source, time, receiver]; windows are cut at the edges."""
-    width = 2 * SMOOTHING + 1
-    return torch.nn.functional.avg_pool2d(values[:, None], width, stride=1, padding=SMOOTHING, count_include_pad=False)[
-        :, 0
-    ]
+def _kept(times: Tensor) -> Tensor:
+    """Indices of at most MOST_TIMES of the times, first and last among them: half of them evenly by number, half by logarithm."""
+    count = len(times)
+    if count <= MOST_TIMES:
+        return torch.arange(count)
+    even = torch.linspace(0, count - 1, MOST_TIMES // 2, dtype=torch.float64).round().long()
+    used = times[times > 0]
+    wanted = torch.logspace(math.log10(float(used[0])), math.log10(float(used[-1])), MOST_TIMES // 2, dtype=times.dtype)
+    return torch.cat([even, torch.searchsorted(times, wanted).clamp(max=count - 1)]).unique()
 
 
 def horizon(transfer: BandTransfer, model: TransferModel) -> float:
     """The time up to which predictions were compared with chains.
 
     That is the last time of the calibration, or infinity where the chains have settled by then, in the last quarter of
-    the times, to their exact long-time average, and the model goes to the same: both within twice the distance
-    of two such ensembles.
+    the times, to their exact long-time average, and the model stays there from then on, at all of 48 later times: both
+    within twice the distance of two such ensembles.
     """
     end = float(transfer.times[-1])
     if transfer.long_time is None or end == 0 or transfer.damping > 0:
@@ -189,9 +189,12 @@ def horizon(transfer: BandTransfer, model: TransferModel) -> float:
     late = transfer.times > 0.75 * end
     noise = 2 * float(statistical_distance(transfer.stderr[:, late]).mean())
     settled = float(total_variation(transfer.mean[:, late], transfer.long_time[:, None]).mean())
-    latest = torch.tensor([end, 100 * end], dtype=transfer.times.dtype)
-    foreseen = model.transfer(latest)[:, -1].detach()
+    later = torch.cat([torch.linspace(end, 2 * end, 24), end * torch.logspace(0.35, math.log10(AHEAD), 24)])
+    try:
+        foreseen = model.transfer(later.to(transfer.times)).detach()
+    except checks.FieldError:  # rates that rounding has blurred by then
+        return end
     if not bool(foreseen.isfinite().all()):
         return end
-    ahead = float(total_variation(foreseen, transfer.long_time).mean())
+    ahead = float(total_variation(foreseen, transfer.long_time[:, None]).mean(0).max())
     return math.inf if settled <= noise and ahead <= noise else end
