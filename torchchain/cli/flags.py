@@ -211,7 +211,7 @@ class Rerun:
     """Make a run again from its record and compare: exit status 0 if all data are equal to the last bit, 1 if not."""
 
     folder: Annotated[str, tyro.conf.Positional, flag("FOLDER")]
-    """left by simulate, calibrate or predict"""
+    """left by simulate, calibrate, predict or import"""
     out: Annotated[str | None, flag("FOLDER", "compared, then discarded")] = None
     """for the new run"""
     device: Annotated[str | None, flag("DEVICE", "the recorded one")] = None
@@ -268,7 +268,7 @@ class FileFlags:
 
 @dataclass(frozen=True)
 class Import(FileFlags):
-    """A band transfer from chains that another code moved, one run a file or pattern: for calibrate --transfer."""
+    """A band transfer from chains or packings that another code moved, one run a file: for calibrate --transfer."""
 
     runs: Annotated[tuple[str, ...], tyro.conf.Positional, flag("FILE|PATTERN ...")] = ()
     """LAMMPS or LIGGGHTS dumps, MercuryDPM .data, extended XYZ, netCDF of convert; plain or gzip"""
@@ -278,20 +278,26 @@ class Import(FileFlags):
     contacts: Annotated[str | None, flag("FILE|PATTERN")] = None
     """contact lists of a run, named like the reference"""
     boundary: Annotated[str, flag(choices.BOUNDARIES, "periodic")] = "periodic"
-    """of the chains; wavenumber bands need rings"""
-    axis: Annotated[str | None, flag(("x", "y", "z"), "the one on which the particles form a line")] = None
-    """of the chains"""
+    """of the chains; wavenumber bands need rings, and packings boxes that are periodic in the file"""
+    axis: Annotated[
+        str | None, flag(("x", "y", "z", "all"), "the one on which the particles form a line, all if they form none")
+    ] = None
+    """of the chains; all: a packing"""
     stiffness: Annotated[str | None, flag("FLOAT|LAW", "1, or what the units are from")] = None
     """of the contacts, in the files' units; or linear, hertz: from force and overlap in the contact lists"""
     units: Annotated[str, flag(choices.UNITS, "file")] = "file"
     """file: mean mass and stiffness are 1 already; mass: the mean mass of all runs and --stiffness become 1; linear,
     hertz: so do mean mass, contact stiffness and overlap of the contact lists"""
-    n_bands: Annotated[int, flag("INT", 32)] = 32
-    """wavenumber bands"""
+    contact: Annotated[str, flag(choices.CONTACTS[:2], "linear")] = "linear"
+    """packings without contact lists: law of the contacts of overlapping grains"""
+    n_bands: Annotated[int | None, flag("INT", "32; of packings 9 or 5")] = None
+    """wavenumber bands; of packings shells of |q| for each polarization, and one for all other motion"""
+    largest: Annotated[float | None, flag("FLOAT", "2 over the mean distance of contacts")] = None
+    """packings: longest wavevector |q| of the shells"""
     long_time: Annotated[str, flag(("exact", "late"), "exact")] = "exact"
     """infinite-time average: from the modes of linear undamped rings, or over the later half of the times"""
     out: Annotated[str, flag("FOLDER", "results/import")] = "results/import"
-    """for transfer.nc, figure.png and run.json"""
+    """for config.toml, transfer.nc, figure.png and run.json"""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tomli_w
 import torch
 
 from torchchain import checks, plots
@@ -20,10 +21,14 @@ from torchchain.cli.flags import Convert, FileFlags, Import
 from torchchain.energy.bands import check_bands
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.transfer import BandTransfer, Provenance
-from torchchain.frames import ContactUnits, Frames, convert, read_frames
+from torchchain.frames import ContactUnits, Frames, check_opening, convert, read_frames
+from torchchain.frames.order import line_axis
 from torchchain.frames.units import LAWS
+from torchchain.network import Network
 from torchchain.progress import log
 
+BANDS, SHELLS = 32, 4
+"""Bands of chains, and shells of |q| of packings, where none are asked for."""
 ENDINGS = r"(\.(gz|dump|lammpstrj|lammps|liggghts|data|xyz|extxyz|nc|txt|local|fstat))+$"
 
 
@@ -40,12 +45,6 @@ class RunFiles:
     path: Path
     reference: Path | None
     contacts: str | None
-
-    @property
-    def all(self) -> list[Path]:
-        """Every file that is read."""
-        contacts = [] if self.contacts is None else sorted(glob.glob(self.contacts)) or [self.contacts]
-        return [self.path, *([self.reference] if self.reference else []), *map(Path, contacts)]
 
 
 def run_import(flags: Import, arguments: list[str]) -> None:
@@ -67,12 +66,14 @@ def run_import(flags: Import, arguments: list[str]) -> None:
         ]  # fmt: skip
         assert transfer.provenance is not None
         hashes = {name: value for name, value in transfer.provenance.hashes.items() if name != "energies"}
+        config = _config(flags, files)
         record = outputs.run_record(
-            arguments, "", "cpu", began, stages.seconds, runs=runs, inputs=hashes, summary=transfer.attributes
+            arguments, config, "cpu", began, stages.seconds, runs=runs, inputs=hashes, summary=transfer.attributes
         )
         outputs.write(
             out,
             {
+                "config.toml": outputs.text(config),
                 "transfer.nc": outputs.dataset(transfer.to_dataset()),
                 "figure.png": outputs.figure(figure),
                 outputs.RECORD: record,
@@ -83,6 +84,16 @@ def run_import(flags: Import, arguments: list[str]) -> None:
     condition = transfer.attributes["start_condition"]
     print(f"starts: {'one band each' if condition == 1 else f'mixed, least squares of condition {condition:.3g}'}")
     print(f"{time.time() - began:.1f} s, results in {flags.out}")
+
+
+def _config(flags: Import, files: list[RunFiles]) -> str:
+    """The flags as TOML, by which the import can be made again from any folder."""
+    given = {name: value for name, value in vars(flags).items() if value is not None and name != "out"}
+    for name in ("reference", "contacts", "masses"):
+        place = Path(given.get(name, ""))
+        if place.parent != Path() or (name == "masses" and place.is_file()):
+            given[name] = str(place.absolute())
+    return tomli_w.dumps(given | {"runs": [str(run.path) for run in files]})
 
 
 def run_convert(flags: Convert) -> None:
@@ -125,9 +136,13 @@ def files_of(flags: Import) -> list[RunFiles]:
         if reference is not None and not reference.is_file():
             raise checks.fail("reference", f"be a file beside {path.name}", f"no file {reference}")
     contacts = {
-        path: None if flags.contacts is None else str(_beside("contacts", flags.contacts, path)) for path in runs
+        path: None if flags.contacts is None else str(_beside("contacts", flags.contacts, path.absolute()))
+        for path in runs
     }
-    return [RunFiles(path, references[path], contacts[path]) for path in runs]
+    return [
+        RunFiles(path.absolute(), found if found is None else found.absolute(), contacts[path])
+        for path, found in ((path, references[path]) for path in runs)
+    ]
 
 
 def _by_number(name: str) -> list[tuple[int, str]]:
@@ -158,14 +173,18 @@ def _beside(field: str, template: str, run: Path) -> Path:
 
 def _check(flags: Import) -> None:
     """What can be said of the flags before anything is read."""
-    checks.integer("n_bands", flags.n_bands, 1)
+    if flags.n_bands is not None:
+        checks.integer("n_bands", flags.n_bands, 1)
+    if flags.largest is not None:
+        checks.number("largest", flags.largest, above=0.0)
+    checks.choice("contact", flags.contact, LAWS)
     checks.choice("boundary", flags.boundary, ("periodic", "fixed"))
     if flags.boundary == "fixed":
         raise checks.fail("boundary", "be 'periodic' for wavenumber bands", "'fixed'")
     checks.choice("units", flags.units, choices.UNITS)
     checks.choice("long_time", flags.long_time, ("exact", "late"))
     if flags.axis is not None:
-        checks.choice("axis", flags.axis, ("x", "y", "z"))
+        checks.choice("axis", flags.axis, ("x", "y", "z", "all"))
     law = flags.stiffness if isinstance(_stiffness(flags), str) else None
     if flags.contacts is None and (law or flags.units in LAWS):
         name, value = ("stiffness", law) if law else ("units", flags.units)
@@ -201,28 +220,40 @@ def _options(flags: FileFlags) -> dict[str, Any]:
     return options
 
 
-def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Chain]]:
-    """The frames of every run and its chain, in the units that are asked for."""
+def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Chain] | list[Network]]:
+    """The frames of every run and its chain or network, in the units that are asked for."""
     frames = [read_frames(run.path, run.contacts, **_options(flags)) for run in files]
-    units = _units(flags, frames)
+    units = _units(flags, files, frames)
     if units is not None:
         frames = [each.scaled(units) for each in frames]
     stiffness = _stiffness(flags)
     if units is not None and not isinstance(stiffness, str):
         stiffness = stiffness / units.unit("stiffness")
+    if line_axis(frames[0].name, frames[0].first, flags.axis) is None:
+        grains = [
+            each.network(run.reference, stiffness=stiffness, contact=flags.contact)
+            for run, each in zip(files, frames, strict=True)
+        ]
+        return frames, grains
     chains = []
-    for each in frames:
-        chains.append(each.chain(flags.boundary, stiffness, axis=flags.axis))
-        check_bands(chains[-1].n_particles, flags.n_bands)
+    for run, each in zip(files, frames, strict=True):
+        chains.append(each.chain(flags.boundary, stiffness, axis=flags.axis, reference=run.reference))
+        check_bands(chains[-1].n_particles, _n_bands(flags, chains[-1]))
     return frames, chains
 
 
-def _units(flags: Import, frames: list[Frames]) -> ContactUnits | None:
+def _n_bands(flags: Import, chain: Chain | Network) -> int:
+    if flags.n_bands is not None:
+        return flags.n_bands
+    return BANDS if isinstance(chain, Chain) else SHELLS * min(2, chain.n_components) + 1
+
+
+def _units(flags: Import, files: list[RunFiles], frames: list[Frames]) -> ContactUnits | None:
     """Units common to all runs: what is 1 is a mean over all of them."""
     if flags.units == "file":
         return None
     if flags.units in LAWS:
-        found = [each.fit_units(flags.units) for each in frames]
+        found = [each.fit_units(flags.units, run.reference) for run, each in zip(files, frames, strict=True)]
         means = (sum(getattr(one, name) for one in found) / len(found) for name in ("mass", "stiffness", "length"))
         return ContactUnits(*means)
     stiffness = _stiffness(flags)
@@ -235,31 +266,39 @@ def _units(flags: Import, frames: list[Frames]) -> ContactUnits | None:
     return ContactUnits(float(torch.cat([mass for mass in masses if mass is not None]).mean()), stiffness, 1.0)
 
 
-def _transfer(flags: Import, files: list[RunFiles], frames: list[Frames], chains: list[Chain]) -> BandTransfer:
+def _transfer(
+    flags: Import, files: list[RunFiles], frames: list[Frames], chains: list[Chain] | list[Network]
+) -> BandTransfer:
     """The band transfer of the runs, one of them in memory at a time."""
 
     def trajectories() -> Iterator[Trajectory]:
         for run, each, chain in zip(files, frames, chains, strict=True):
-            path = each.trajectory(run.reference, axis=flags.axis, chain=chain)
-            assert isinstance(path, Trajectory), "of particles that form a chain"
+            path = each.trajectory(run.reference, axis=flags.axis)
+            if isinstance(chain, Chain):
+                check_opening(each.name, chain, path)
             yield path
 
-    hashes = {str(path): outputs.sha256(path) for run in files for path in run.all}
+    read = [path for run, each in zip(files, frames, strict=True) for path in (*each.files, run.reference) if path]
+    hashes = {str(path): outputs.sha256(path) for path in dict.fromkeys(path.absolute() for path in read)}
     first = frames[0]
     words = f"{len(files)} runs of {chains[0].n_particles} particles, {files[0].path.name}{' ...' if len(files) > 1 else ''}"
     log.info("band energies of %s", first)
     late = "late" if flags.long_time == "late" else None
     try:
         return BandTransfer.from_trajectories(
-            chains, trajectories(), flags.n_bands, late, Provenance("imported", words, hashes)
+            chains,
+            trajectories(),
+            _n_bands(flags, chains[0]),
+            late,
+            Provenance("imported", words, hashes),
+            [run.path.name for run in files],
+            flags.largest,
         )
     except checks.FieldError as error:
-        found = re.match(r"run (\d+): (.*)", str(error), re.DOTALL)
-        if found is None:
+        if flags.reference is not None or ": total energy" not in str(error):
             raise
-        rest = flags.reference is None and "total energy" in found[2]
-        hint = " (at rest in its first frame: the chain without a wave is named by --reference)" if rest else ""
-        raise checks.FieldError(f"{files[int(found[1]) - 1].path.name}: {found[2]}{hint}") from None
+        hint = "at rest in its first frame: the chain without a wave is named by --reference"
+        raise checks.FieldError(f"{error} ({hint})") from None
 
 
 def _figure(transfer: BandTransfer) -> Any:

@@ -17,18 +17,28 @@ from safetensors.numpy import load_file
 from torchchain import checks
 from torchchain.cli import outputs
 from torchchain.cli.calibrate import run_calibrate
-from torchchain.cli.flags import Calibrate, Predict, Rerun, Simulate
+from torchchain.cli.flags import Calibrate, Import, Predict, Rerun, Simulate
+from torchchain.cli.imports import run_import
 from torchchain.cli.predict import run_predict
 from torchchain.cli.simulate import run_simulate
 from torchchain.ensemble import ranks
+from torchchain.ensemble.scene import read_toml
 from torchchain.results import read_dataset
 
-COMMANDS = ("simulate", "calibrate", "predict")
-DATA = {"simulate": ("results.nc",), "calibrate": ("transfer.nc", "model.safetensors"), "predict": ("results.nc",)}
-NEEDED = {"files": dict, "versions": dict, "device": str, "config_sha256": str}
-NEEDED_OF_PREDICT = {"method": str, "model.path": str, "model.sha256": str}
-NEEDED_OF_ENSEMBLE = {"resolved.method": str, "resolved.options": dict}
-NEEDED_OF_TRANSFER = {"transfer.path": str, "transfer.sha256": str}
+COMMANDS = ("simulate", "calibrate", "predict", "import")
+DATA = {
+    "simulate": ("results.nc",),
+    "calibrate": ("transfer.nc", "model.safetensors"),
+    "predict": ("results.nc",),
+    "import": ("transfer.nc",),
+}
+NEEDED: dict[str, type] = {"files": dict, "versions": dict, "device": str, "config_sha256": str}
+NEEDED_OF: dict[str, dict[str, type]] = {
+    "predict": {"method": str, "model.path": str, "model.sha256": str},
+    "import": {"inputs": dict},
+}
+NEEDED_OF_ENSEMBLE: dict[str, type] = {"resolved.method": str, "resolved.options": dict}
+NEEDED_OF_TRANSFER: dict[str, type] = {"transfer.path": str, "transfer.sha256": str}
 SAID_ELSEWHERE = ("torchchain_version",)  # attributes that the record's versions hold
 
 
@@ -78,7 +88,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     if not isinstance(arguments, list) or not arguments or arguments[0] not in COMMANDS or "files" not in record:
         raise checks.fail(where, f"hold a run of {', '.join(COMMANDS)}", checks.shown(arguments))
     source = NEEDED_OF_TRANSFER if "transfer" in record else NEEDED_OF_ENSEMBLE
-    needed = NEEDED | (NEEDED_OF_PREDICT if arguments[0] == "predict" else source)
+    needed = NEEDED | NEEDED_OF.get(arguments[0], source)
     for name, kind in needed.items():
         held: Any = record
         for key in name.split("."):
@@ -108,6 +118,12 @@ def _again(record: Mapping[str, Any], folder: Path, out: Path, flags: Rerun) -> 
     config, place = str(folder / "config.toml"), str(out)
     device = flags.device or record["device"].partition(": ")[0]
     with contextlib.redirect_stdout(io.StringIO()):
+        if record["arguments"][0] == "import":
+            for path, digest in record["inputs"].items():
+                _same_file("inputs", {"path": path, "sha256": digest})
+            words = read_toml(folder / "config.toml")
+            run_import(Import(**words | {"runs": tuple(words["runs"]), "out": place}), record["arguments"])
+            return
         if record["arguments"][0] == "predict":
             model = _same_file("model", record["model"])
             request = Predict(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +13,8 @@ from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.energy.bands import check_bands
 from torchchain.energy.wavenumber import band_energy, long_time_band_energy
+from torchchain.frames import check_energy
+from torchchain.network import Network, NetworkTrajectory, PackingBands, packing_band_energy, packing_bands
 
 PURE = 0.99
 """Share of the energy in one band from which a run counts as one that starts in it alone."""
@@ -55,19 +57,29 @@ class Runs:
 
 
 def gathered(
-    chains: Chain | Iterable[Chain], trajectories: Trajectory | Iterable[Trajectory], n_bands: int, exact: bool
+    chains: Chain | Network | Iterable[Chain | Network],
+    trajectories: Trajectory | Iterable[Trajectory],
+    n_bands: int,
+    exact: bool,
+    names: Sequence[str] | None = None,
+    largest: float | None = None,
 ) -> Runs:
     """Band energies of runs, one after the other: trajectories that are read when they are asked for stay in memory singly.
 
     Args:
-        chains, trajectories: one of each, or as many of one as of the other; those with batch axes hold several runs.
+        chains, trajectories: one of each (chains, or networks), or as many of one as of the other; those with batch axes hold several runs.
         n_bands: B.
+        names: of the runs, for messages; by default run 1, run 2, ...
+        largest: of networks, the longest wavevector; by default that of the first, for all.
         exact: also take the infinite-time average from the modes, where all chains are linear undamped rings.
 
     Raises:
         FieldError: naming the run, for times or a number of particles that differ from those of the first.
+
+    Warns:
+        FramesWarning: naming the run, for energy that drifts on a chain without damping.
     """
-    chains = [chains] if isinstance(chains, Chain) else chains
+    chains = [chains] if isinstance(chains, (Chain, Network)) else chains
     trajectories = [trajectories] if isinstance(trajectories, Trajectory) else trajectories
     for name, value in (("chains", chains), ("trajectories", trajectories)):
         if not checks.is_collection(value):
@@ -75,28 +87,34 @@ def gathered(
     numbers: dict[bytes, int] = {}
     kinds: list[tuple[Tensor, Tensor]] = []
     times = torch.zeros(0, dtype=torch.float64)
+    shells: PackingBands | None = None
     energies: list[Tensor] = []
     belongs: list[int] = []
     firsts: list[tuple[Tensor, Tensor]] = []
     trajectory_of = iter(trajectories)
     run = 0
     for run, chain in enumerate(chains, 1):
-        checks.instance(f"chains, run {run}", chain, Chain)
+        name = f"run {run}" if names is None else names[run - 1]
+        checks.instance(f"chains, {name}", chain, Chain, Network)
         path = next(trajectory_of, None)
         if path is None:
             raise checks.fail("trajectories", "be as many as chains", f"{run - 1} of them")
-        checks.instance(f"trajectories, run {run}", path, Trajectory)
-        check_bands(chain.n_particles, n_bands)
+        checks.instance(f"trajectories, {name}", path, Trajectory)
         try:
-            energy = band_energy(chain, path, n_bands)
+            shells = _shells(chain, shells, n_bands, largest)
+            energy = _energy(chain, path, n_bands, shells)
         except checks.FieldError as error:
-            raise checks.FieldError(f"run {run}: {error}") from None
+            raise checks.FieldError(f"{name}: {error}") from None
+        check_energy(name, chain, path)
         own = (path.times - path.times[0]).detach().cpu().double()
         if not energies:
             times = own
-        _check_same(run, own, times, chain.n_particles, kinds)
-        exact = exact and chain.is_free and chain.contact == "linear" and not chain.is_damped
-        start = path.displacement[..., 0, :].detach()
+        _check_same(name, own, times, chain.n_particles, kinds)
+        start = path.displacement.select(-1 - len(path.axes_of_a_state), 0).detach()
+        if isinstance(chain, Chain) and chain.is_free and chain.contact == "linear" and not chain.is_damped:
+            firsts.append((_rows(start), _rows(path.velocity[..., 0, :])))
+        else:
+            exact = False
         for masses, stiffness in _of_runs(chain, start):
             key = masses.numpy().tobytes() + stiffness.numpy().tobytes()
             if key not in numbers:
@@ -104,7 +122,6 @@ def gathered(
                 kinds.append((masses, stiffness))
             belongs.append(numbers[key])
         energies.append(energy.detach().cpu().double().reshape(-1, *energy.shape[-2:]))
-        firsts.append((_rows(start), _rows(path.velocity[..., 0, :])))
     if not run:
         raise checks.fail("chains", "be at least one", "none")
     if next(trajectory_of, None) is not None:
@@ -121,25 +138,54 @@ def gathered(
     return Runs(times, together, realization, late, torch.stack([masses for masses, _ in kinds]))
 
 
-def _check_same(run: int, own: Tensor, times: Tensor, n_particles: int, kinds: list[tuple[Tensor, Tensor]]) -> None:
+def _shells(
+    chain: Chain | Network, shells: PackingBands | None, n_bands: int, largest: float | None
+) -> PackingBands | None:
+    """The bands of a network: those of the first, as many as are asked for."""
+    if not isinstance(chain, Network) or shells is not None:
+        return shells
+    kinds = 2 if chain.n_components > 1 else 1
+    if n_bands < 1 + kinds or (n_bands - 1) % kinds:
+        rule = f"be {kinds} times the shells of |q| and 1, for what is in none of them"
+        raise checks.fail("n_bands", rule, n_bands)
+    return packing_bands(chain, (n_bands - 1) // kinds, largest)
+
+
+def _energy(chain: Chain | Network, path: Trajectory, n_bands: int, shells: PackingBands | None) -> Tensor:
+    """Share of every band, (*any, time, band)."""
+    if isinstance(chain, Network):
+        if chain.batch_shape:
+            raise checks.fail("network", "be one for each run", f"a batch {tuple(chain.batch_shape)}")
+        assert shells is not None
+        return packing_band_energy(chain, path, shells)
+    if isinstance(path, NetworkTrajectory):
+        raise checks.fail("chains", "be a network for motion in several directions", "a chain")
+    check_bands(chain.n_particles, n_bands)
+    return band_energy(chain, path, n_bands)
+
+
+def _check_same(name: str, own: Tensor, times: Tensor, n_particles: int, kinds: list[tuple[Tensor, Tensor]]) -> None:
     """An error unless a run has the times and the number of particles of the first."""
     # Times that a time step times a step number gives agree to rounding only.
     if own.shape != times.shape or not torch.allclose(own, times, rtol=1e-9, atol=1e-9 * float(times[-1])):
         raise checks.fail(
-            f"run {run}: times",
+            f"{name}: times",
             f"be those of the first run ({len(times)} to {float(times[-1]):g})",
             f"{len(own)} to {float(own[-1]):g}",
         )
     if kinds and len(kinds[0][0]) != n_particles:
-        raise checks.fail(f"run {run}: particles", f"be {len(kinds[0][0])} as in the first run", n_particles)
+        raise checks.fail(f"{name}: particles", f"be {len(kinds[0][0])} as in the first run", n_particles)
 
 
 def _rows(values: Tensor) -> Tensor:
     return values.detach().cpu().double().reshape(-1, values.shape[-1])
 
 
-def _of_runs(chain: Chain, start: Tensor) -> Iterable[tuple[Tensor, Tensor]]:
-    """Masses and contact stiffness of every run."""
+def _of_runs(chain: Chain | Network, start: Tensor) -> Iterable[tuple[Tensor, Tensor]]:
+    """Masses of every run, and what else tells its chain or network from others: contact stiffness, positions."""
+    if isinstance(chain, Network):
+        rest = torch.cat([chain.bond_stiffness.flatten(), chain.positions.flatten()]).detach().cpu().double()
+        return [(chain.masses.detach().cpu().double(), rest)] * start.shape[:-2].numel()
     masses = _rows(chain.align(chain.masses, start).expand(start.shape))
     stiffness = chain.align(chain.contact_stiffness, start)
     stiffness = _rows(stiffness.expand(*start.shape[:-1], stiffness.shape[-1]))

@@ -69,13 +69,30 @@ def fit_transfer(starts: Tensor, energies: Tensor, realization: Tensor) -> Fitte
     left_out = []
     for part in parts:
         kept = ~torch.isin(realization, part)
-        condition_of(starts[kept])  # an error where one block alone excites some band
+        _check_left(starts, kept, realization)
         left_out.append(_solved(starts[kept], energies[kept]))
     replicates = torch.stack(left_out)
     spread = (replicates - replicates.mean(0)).square().sum(0)
     stderr = (spread * (blocks - 1) / blocks).sqrt()
     pseudo = blocks * mean - (blocks - 1) * replicates
     return FittedTransfer(mean, stderr, pseudo, tuple(len(part) for part in parts), condition)
+
+
+def _check_left(starts: Tensor, kept: Tensor, realization: Tensor) -> None:
+    """An error that counts chains where the runs that are kept for a standard error do not tell the bands apart."""
+    try:
+        condition_of(starts[kept])
+    except checks.FieldError as error:
+        sizes, n = starts.norm(dim=0), len(torch.unique(realization))
+        share = starts[kept].norm(dim=0) / sizes
+        band = int(share.argmin())
+        on = len(torch.unique(realization[starts[:, band] > 1e-6 * sizes[band]]))
+        rule = "excite every band in runs on at least 2 chains, as standard errors leave out some at a time"
+        if on < 2:
+            raise checks.fail("starts", rule, f"band {band + 1} on {on} of {n} chains") from None
+        raise checks.fail(
+            "starts", f"tell the bands apart without any one of {n} chains ({rule})", str(error)
+        ) from None
 
 
 def condition_of(starts: Tensor) -> float:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from torchchain.ensemble.run import ensemble_moments
 from torchchain.ensemble.scene import Scene, describe
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.statistics import EnsembleMoments, Moments, merged
+from torchchain.network import Network
 from torchchain.theory.law import law_of
 from torchchain.theory.transfer import theory_transfer
 from torchchain.threads import single_thread
@@ -376,26 +377,32 @@ class BandTransfer(Printed):
     @classmethod
     def from_trajectories(
         cls,
-        chains: Chain | Iterable[Chain],
+        chains: Chain | Network | Iterable[Chain | Network],
         trajectories: Trajectory | Iterable[Trajectory],
         n_bands: int,
         long_time: Any = None,
         provenance: str | Provenance = "",
+        names: Sequence[str] | None = None,
+        largest: float | None = None,
     ) -> BandTransfer:
-        """A band transfer from the motion of chains, simulated by any code: the bands each run starts in are found.
+        """A band transfer from the motion of chains or networks, by any code: the bands each run starts in are found.
 
         Runs that all start in one band each (0.99 of the energy in their first frame) are averaged; of runs that start in
         several bands at once, or leave out some band on some chain, the transfer is the least-squares fit. Runs on
         chains of equal masses are runs of one realization.
 
         Args:
-            chains: one for each run, linear, with an even number of particles; or one with batch axes.
+            chains: one for each run, linear, with an even number of particles; or one with batch axes. Or networks in
+                periodic boxes, packings for instance, one for each run.
             trajectories: one for each chain, all with the same times, (*batch, *any, time, particle); may be a generator
                 that reads one after the other.
-            n_bands: B.
+            n_bands: B; of networks the shells of |q| of each polarization, and one band for what is in none of them: see
+                :func:`torchchain.network.packing_bands`.
             long_time: infinite-time average, (source, receiver); "late" for that over the later half of the times; by
                 default the exact one from the modes of the chains, if all are undamped rings, else "late".
             provenance: where the runs come from, in words.
+            names: of the runs, as many, for messages; by default run 1, run 2, ...
+            largest: of networks, |q| up to which shells go; by default 2 over the mean bond length of the first.
 
         Returns:
             BandTransfer whose scene is None, with the attributes ``mass_mean``, ``mass_sd`` and ``start_condition``.
@@ -410,11 +417,14 @@ class BandTransfer(Printed):
         Raises:
             FieldError, FieldTypeError: naming the run, for one whose times or particles are not those of the first or that
                 has no energy; and for starts that leave out a band or do not tell the bands apart.
+
+        Warns:
+            FramesWarning: naming run and frame, for energy that drifts on a chain without damping.
         """
         n_bands = checks.integer("n_bands", n_bands, 1)
         if isinstance(long_time, str):
             checks.choice("long_time", long_time, ("late",))
-        runs = gathered(chains, trajectories, n_bands, exact=long_time is None)
+        runs = gathered(chains, trajectories, n_bands, long_time is None, names, largest)
         late = runs.long_time if long_time is None or isinstance(long_time, str) else long_time
         attributes = {"mass_mean": float(runs.masses.mean()), "mass_sd": float(runs.masses.std(correction=0))}
         table = runs.table()

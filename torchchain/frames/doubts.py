@@ -12,6 +12,7 @@ from torch import Tensor
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
 from torchchain.frames.record import AXES, Frame, FramesWarning
+from torchchain.network import Network, total_energy
 
 DRIFT = 0.01  # share of the energy that an undamped run may gain or lose before a warning
 NOISE = 1e-3  # share of the displacement that the digits of the positions may leave out
@@ -100,30 +101,40 @@ def check_across(name: str, frame: Frame, axis: str) -> None:
         )
 
 
-def check_energy(name: str, chain: Chain, path: Trajectory) -> None:
-    """Warnings for a motion that the chain does not make: energy that drifts without damping, contacts that open.
+def check_energy(name: str, chain: Chain | Network, path: Trajectory) -> None:
+    """A warning for a motion that the chain, or network, does not make: energy that drifts without damping.
 
     Args:
-        name: of the file, for the warnings.
+        name: of the file or run, for the warning.
         chain: in the units of the trajectory.
-        path: (time, particle).
+        path: (*any, time, particle), of a network (*any, time, particle, component).
 
     Example:
         >>> chain = tc.Chain(tc.Disorder().masses(32, 1, 0)[0])
         >>> path = tc.evolve(chain, tc.standing_wave(chain, tone=3), [0.0, 10.0], method="modes")
         >>> tc.frames.check_energy("run.dump", chain, path)  # energy is kept: no warning
     """
-    kinetic = (chain.masses * path.velocity.square()).sum(-1) / 2
-    total = kinetic + chain.contact_energy(path.displacement).sum(-1)
-    start = float(total[0])
-    if not chain.is_damped and start > 0:
-        change = (total / start - 1).abs()
-        if float(change.max()) > DRIFT:
-            k = int(change.argmax())
-            warn(
-                f"{name}, frame {k + 1}: energy",
-                f"{float(total[k] / start):.4g} of that of frame 1, for a chain without damping: damping or too long a time step there, or another stiffness than the chain's",
-            )
+    if chain.is_damped:
+        return
+    if isinstance(chain, Network):
+        energy, kind = total_energy(chain, path), "network"
+    else:
+        kinetic = (chain.align(chain.masses, path.velocity) * path.velocity.square()).sum(-1) / 2
+        energy, kind = kinetic + chain.contact_energy(path.displacement).sum(-1), "chain"
+    total = energy.detach().reshape(-1, len(path.times))
+    start = total[:, :1]
+    change = torch.where(start > 0, total / start - 1, 0.0)
+    worst = int(change.abs().argmax())
+    run, k = divmod(worst, len(path.times))
+    if abs(float(change[run, k])) > DRIFT:
+        warn(
+            f"{name}, frame {k + 1}: energy",
+            f"{1 + float(change[run, k]):.4g} of that of frame 1, for a {kind} without damping: damping or too long a time step there, or another stiffness than the {kind}'s",
+        )
+
+
+def check_opening(name: str, chain: Chain, path: Trajectory) -> None:
+    """A warning for contacts that open; arguments as for :func:`check_energy`, (time, particle)."""
     stretch = chain.elongation(path.displacement)
     if float(stretch.max()) >= 1:
         k = int(stretch.amax(-1).argmax())

@@ -11,8 +11,9 @@ from torchchain import checks
 from torchchain.chain.states import Trajectory
 from torchchain.frames.doubts import check_across, check_bounds, check_digits, here, warn
 from torchchain.frames.order import check_contact_order, line_axis, line_order
-from torchchain.frames.record import AXES, Box, Frame, VectorTrajectory
+from torchchain.frames.record import AXES, Box, Frame
 from torchchain.memory import gigabytes, memory
+from torchchain.network import NetworkTrajectory
 
 
 def displacements(
@@ -24,7 +25,7 @@ def displacements(
     reference_name: str,
     axis: str | None,
     length: float,
-) -> Trajectory | VectorTrajectory:
+) -> Trajectory:
     """Displacements from a reference, and velocities; see :meth:`Frames.trajectory`."""
     _check_alike(name, first, reference, reference_name)
     line = line_axis(name, first, axis)
@@ -83,7 +84,7 @@ def displacements(
         _check_line(name, numbers, moved[..., 0], first, reference, order, line)
         check_across(name, last, line)
         return Trajectory(times - times[0], moved[..., 0], velocity[..., 0])
-    return VectorTrajectory(times - times[0], moved, velocity)
+    return NetworkTrajectory(times - times[0], moved, velocity)
 
 
 def _period(box: Box | None, axis: str) -> float:

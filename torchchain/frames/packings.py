@@ -1,36 +1,115 @@
-"""From a frame to the network of its grains in contact."""
+"""From a frame to the network of its grains in contact: overlapping disks or spheres, or a contact list."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import torch
+from torch import Tensor
 
 from torchchain import checks
-from torchchain.frames.doubts import here
+from torchchain.frames.doubts import here, warn
 from torchchain.frames.record import AXES, Frame
-from torchchain.frames.units import finite_masses
-from torchchain.network import Packing, packing
+from torchchain.frames.units import LAWS, at_rest, contact_stiffness, finite_masses, periods, separation
+from torchchain.network import Network, Packing, packing
+from torchchain.network.packings import contact_law
 
 
 def network(
-    name: str, frame: Frame, at_rest: Frame, stiffness: float, contact: str, damping: float, prestress: bool
-) -> Packing:
-    """The network of the contacts of overlapping grains; see :meth:`Frames.network`.
+    name: str, frame: Frame, reference: Frame, stiffness: float | str, contact: str, damping: float, prestress: bool
+) -> Network:
+    """The network of the contacts of grains; see :meth:`Frames.network`.
 
     Args:
         name: of the file.
-        frame: masses, ids, and radii where the state at rest has none.
-        at_rest: positions and box.
-        stiffness, contact, damping, prestress: as for :func:`torchchain.packing`.
+        frame: masses, ids, and radii and contacts where the state at rest has none.
+        reference: the state at rest: positions and box.
+        stiffness: a number as for :func:`torchchain.packing`, or "linear" or "hertz": from force and overlap in the list.
+        contact, damping, prestress: as for :func:`torchchain.packing`.
     """
-    if not torch.equal(frame.ids, at_rest.ids):
-        raise checks.fail(f"{here(name, at_rest)}: ids", f"be those of {here(name, frame)}", "others")
-    radii = at_rest.radii if at_rest.radii is not None else frame.radii
-    if radii is None:
-        raise checks.fail(f"{here(name, frame)}: radius", "be in the file for a network of contacts", "none")
-    box = None
-    if at_rest.box is not None and any(at_rest.box.periodic[AXES.index(axis)] for axis in at_rest.axes):
-        lengths, marked = at_rest.box.lengths, at_rest.box.periodic
-        periods = [float(lengths[i]) if marked[i] else torch.inf for i in map(AXES.index, at_rest.axes)]
-        box = torch.tensor(periods, dtype=torch.float64)
+    if not torch.equal(frame.ids, reference.ids):
+        raise checks.fail(f"{here(name, reference)}: ids", f"be those of {here(name, frame)}", "others")
+    checks.choice("contact", contact, LAWS)
     masses = finite_masses(name, frame)
-    return packing(at_rest.positions, radii, masses, box, stiffness, contact, damping, prestress)
+    found = [AXES.index(axis) for axis in reference.axes]
+    sides = periods(reference.box)[found]
+    box = sides if bool(sides.isfinite().any()) else None
+    radii = reference.radii if reference.radii is not None else frame.radii
+    if isinstance(stiffness, str):
+        checks.choice("stiffness", stiffness, LAWS)
+        contact = stiffness
+    rested = replace(reference, masses=masses, radii=radii, contacts=at_rest(frame, reference, contact))
+    if rested.contacts is None:
+        if isinstance(stiffness, str):
+            contact_stiffness(name, rested, stiffness)  # an error: there is no list
+        if radii is None:
+            raise checks.fail(
+                f"{here(name, frame)}: radius",
+                "be in the file for a network of contacts, or contact lists with it (a chain: name its axis)",
+                "none",
+            )
+        return packing(
+            reference.positions,
+            radii,
+            masses,
+            box,
+            checks.number("stiffness", stiffness, above=0),
+            contact,
+            damping,
+            prestress,
+        )
+    rested = _between_grains(name, rested)
+    force, slope = _laws(name, rested, stiffness, contact, prestress)
+    assert rested.contacts is not None
+    fields: dict[str, Any] = {
+        "masses": masses, "positions": reference.positions, "bonds": rested.contacts.pairs, "stiffness": slope,
+        "tension": -force if prestress else 0.0, "box": box, "damping": damping,
+    }  # fmt: skip
+    try:
+        if radii is not None and not isinstance(stiffness, str):
+            return Packing(**fields, radii=radii, contact=contact, modulus=float(stiffness))
+        return Network(**fields)
+    except checks.FieldError as error:
+        raise checks.FieldError(f"{here(name, reference)}: {error}") from None
+
+
+def _between_grains(name: str, frame: Frame) -> Frame:
+    """The frame with contacts between its particles only, and those that are closed."""
+    contacts = frame.contacts
+    assert contacts is not None
+    walls = (contacts.pairs < 0).any(-1)
+    if bool(walls.any()):
+        warn(f"{here(name, frame)}: contacts", f"{int(walls.sum())} with walls are left out, as a network has none")
+    pairs = contacts.pairs[~walls]
+    overlap, force = (None if v is None else v[~walls] for v in (contacts.overlap, contacts.normal_force))
+    if overlap is None and frame.radii is not None and len(pairs):
+        overlap = frame.radii[pairs].sum(-1) - separation(frame, pairs)
+    if overlap is not None and bool((overlap <= 0).any()):
+        open_ones = overlap <= 0
+        warn(f"{here(name, frame)}: contacts", f"{int(open_ones.sum())} of {len(pairs)} are open and left out")
+        pairs, overlap, force = pairs[~open_ones], overlap[~open_ones], None if force is None else force[~open_ones]
+    if not len(pairs):
+        raise checks.fail(f"{here(name, frame)}: contacts", "be at least one between two particles", "none")
+    return replace(frame, contacts=replace(contacts, pairs=pairs, overlap=overlap, normal_force=force))
+
+
+def _laws(name: str, frame: Frame, stiffness: float | str, contact: str, prestress: bool) -> tuple[Tensor, Tensor]:
+    """Force and its slope at every contact."""
+    contacts = frame.contacts
+    assert contacts is not None
+    if isinstance(stiffness, str):
+        slope = contact_stiffness(name, frame, stiffness)
+        assert contacts.normal_force is not None
+        return contacts.normal_force, slope
+    modulus = checks.number("stiffness", stiffness, above=0)
+    if contacts.overlap is not None:
+        return contact_law(contacts.overlap, contact, modulus)
+    if prestress or contact == "hertz":
+        raise checks.fail(
+            f"{here(name, frame)}: overlap",
+            "be in the contact list, or radii in the file, for contacts under pressure (or linear ones with prestress=False)",
+            "none",
+        )
+    zero = torch.zeros(len(contacts.pairs), dtype=torch.float64)
+    return zero, zero + modulus

@@ -19,14 +19,14 @@ from torchchain.chain.states import Trajectory
 from torchchain.frames import netcdf
 from torchchain.frames.building import build, kept, own_contacts
 from torchchain.frames.chains import chain as make_chain
-from torchchain.frames.doubts import check_energy, here
+from torchchain.frames.doubts import check_energy, check_opening, here
 from torchchain.frames.motion import displacements
 from torchchain.frames.opening import File, Place, Source, find, time_of
 from torchchain.frames.packings import network as make_network
-from torchchain.frames.record import Box, Contacts, Frame, VectorTrajectory
+from torchchain.frames.record import Box, Contacts, Frame
 from torchchain.frames.registry import Entry, Raw
-from torchchain.frames.units import ContactUnits, fit_units, scaled_contacts
-from torchchain.network import Packing
+from torchchain.frames.units import LAWS, ContactUnits, at_rest, fit_units, scaled_contacts
+from torchchain.network import Network, NetworkTrajectory
 
 
 def read_frames(
@@ -164,6 +164,18 @@ class Frames:
         return torch.tensor(times, dtype=torch.float64) / self._unit("time")
 
     @property
+    def files(self) -> list[Path]:
+        """Every file that is read: of frames, of contacts, and of masses."""
+        given = self._options.get("masses")
+        found = [file.path for place in self._places for file in (place.file, place.contact_file) if file is not None]
+        if isinstance(given, (str, os.PathLike)):
+            found.append(Path(given))
+        elif given is None and self._options.get("density") is None:
+            beside = self._places[0].file.format.sibling(self._places[0].file.path)
+            found += [beside] if beside is not None else []
+        return list(dict.fromkeys(found))
+
+    @property
     def steps(self) -> Tensor | None:
         """Time step number of every frame, (frame,), or None."""
         steps = [place.entry.step for place in self._places]
@@ -239,15 +251,16 @@ class Frames:
             raise checks.fail("units", "be given once", "frames that are scaled already")
         return Frames(self._places, self._options, self.file_units, units, self._keep, self._origin)
 
-    def fit_units(self, law: str = "hertz", reference: Frames | Frame | None = None) -> ContactUnits:
+    def fit_units(self, law: str = "hertz", reference: Source | Frames | Frame | None = None) -> ContactUnits:
         """Units in which mean mass, mean contact stiffness and mean overlap are 1, from the contact list of a state at rest.
 
         Args:
             law: "hertz", stiffness (3/2) F / overlap, or "linear", F / overlap.
-            reference: the state at rest; by default the first frame.
+            reference: the state at rest, as for :meth:`trajectory`, by default the first frame; without a contact list of
+                its own, that of the first frame is carried over to it.
         """
-        frame = reference[0] if isinstance(reference, Frames) else (reference or self.first)
-        return fit_units(self.name, frame, law)
+        checks.choice("law", law, LAWS)
+        return fit_units(self.name, self._rested(reference, law), law)
 
     # Chains
 
@@ -259,6 +272,7 @@ class Frames:
         axis: str | None = None,
         contact: str = "linear",
         damping: Any = 0.0,
+        reference: Source | Frames | Frame | None = None,
     ) -> Chain:
         """The chain of these particles: their masses in their order along an axis.
 
@@ -267,6 +281,7 @@ class Frames:
             stiffness: a number or (contact,); or "linear" or "hertz": from force and overlap in the contact list.
             axis: "x", "y" or "z"; by default the one on which the particles form a line.
             contact, damping: as for :class:`torchchain.Chain`.
+            reference: the state at rest, at which a stiffness from the contact list is taken, as for :meth:`fit_units`.
 
         Raises:
             FieldError: without masses, for particles that form no line, for contacts between others than neighbors.
@@ -274,22 +289,24 @@ class Frames:
         Warns:
             FramesWarning: for a mean mass far from 1, and a box that is not periodic where the chain is.
         """
-        return make_chain(self.name, self.first, boundary, stiffness, axis, contact, damping)
+        frame = self._rested(reference, stiffness) if isinstance(stiffness, str) else self.first
+        return make_chain(self.name, frame, boundary, stiffness, axis, contact, damping)
 
     def trajectory(
         self, reference: Source | Frames | Frame | None = None, *, axis: str | None = None, chain: Chain | None = None
-    ) -> Trajectory | VectorTrajectory:
+    ) -> Trajectory:
         """Displacements from a reference, across periodic boundaries, and velocities.
 
         Args:
             reference: the state without a wave: a file of one frame, frames or a frame; by default the first frame.
             axis: "x", "y" or "z" for a chain along it; "all" for vectors, in the order of the ids; by default the axis on
                 which the particles form a line, "all" if they form none.
-            chain: if given, energy that drifts and contacts that open are looked for; see :func:`check_energy`.
+            chain: if given, energy that drifts and contacts that open are looked for; see
+                :func:`check_energy` and :func:`check_opening`.
 
         Returns:
             Trajectory with times counted from the first frame, and displacement and velocity (time, particle) in the order of
-            :meth:`chain`; or VectorTrajectory, (time, particle, axis), in the order of the ids and of :meth:`network`.
+            :meth:`chain`; or NetworkTrajectory, (time, particle, axis), in the order of the ids and of :meth:`network`.
 
         Raises:
             FieldError: for other particles than the reference's, for neighbors that pass each other, without velocities or times.
@@ -297,42 +314,56 @@ class Frames:
         Warns:
             FramesWarning: for displacements above the overlap, positions of too few digits, and motion across the chain.
         """
-        at_rest, name = self._reference(reference)
-        found = displacements(self.name, self, len(self), self.first, at_rest, name, axis, self._unit("length"))
+        rest, name = self._reference(reference)
+        found = displacements(self.name, self, len(self), self.first, rest, name, axis, self._unit("length"))
         if chain is not None:
             checks.instance("chain", chain, Chain)
-            if not isinstance(found, Trajectory) or chain.masses.shape != found.displacement.shape[-1:]:
+            if isinstance(found, NetworkTrajectory) or chain.masses.shape != found.displacement.shape[-1:]:
                 raise checks.fail(
                     "chain",
                     f"have masses of shape {tuple(found.displacement.shape[1:])}",
                     f"shape {tuple(chain.masses.shape)}",
                 )
             check_energy(self.name, chain, found)
+            check_opening(self.name, chain, found)
         return found
 
     def network(
         self,
         reference: Source | Frames | Frame | None = None,
         *,
-        stiffness: float = 1.0,
+        stiffness: float | str = 1.0,
         contact: str = "linear",
         damping: float = 0.0,
         prestress: bool = True,
-    ) -> Packing:
-        """The network of these particles where they overlap: disks or spheres, in the order of the ids, in their box.
+    ) -> Network:
+        """The network of these particles in contact, in the order of the ids, in their box.
+
+        Contacts are those of the contact list, where the frames were read with one, else of overlapping disks or spheres.
 
         Args:
             reference: the state at rest, as for :meth:`trajectory`; by default the first frame.
-            stiffness, contact, damping, prestress: as for :func:`torchchain.packing`, in the units of the frames.
+            stiffness: as for :func:`torchchain.packing`, in the units of the frames; or "linear" or "hertz": from force and
+                overlap of each contact in the list.
+            contact, damping, prestress: as for :func:`torchchain.packing`.
 
         Returns:
-            Packing, whose states have the axes (particle, axis) that the file holds.
+            Packing, whose states have the axes (particle, axis) that the file holds; of a contact list without radii, or
+            with its own stiffnesses, a Network.
 
         Raises:
-            FieldError: without masses or radii.
+            FieldError: without masses, or without both radii and contacts; for a contact listed twice.
+
+        Warns:
+            FramesWarning: for contacts with walls, and open ones, which are left out.
         """
-        at_rest, _ = self._reference(reference)
-        return make_network(self.name, self.first, at_rest, stiffness, contact, damping, prestress)
+        rest, _ = self._reference(reference)
+        return make_network(self.name, self.first, rest, stiffness, contact, damping, prestress)
+
+    def _rested(self, reference: Source | Frames | Frame | None, law: str) -> Frame:
+        """The first frame with its contacts as they are at rest."""
+        rest, _ = self._reference(reference)
+        return replace(self.first, contacts=at_rest(self.first, rest, law))
 
     def _reference(self, reference: Source | Frames | Frame | None) -> tuple[Frame, str]:
         if reference is None:

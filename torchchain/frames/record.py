@@ -111,22 +111,3 @@ class Frame:
     radii: Tensor | None = None
     box: Box | None = None
     contacts: Contacts | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class VectorTrajectory:
-    """Motion of particles that form no line, in the order of their ids.
-
-    Attributes:
-        times: (time,).
-        displacement, velocity: (time, particle, axis).
-
-    Example:
-        >>> still = torch.zeros(1, 5, 3)
-        >>> tc.frames.VectorTrajectory(torch.zeros(1), still, still).displacement.shape
-        torch.Size([1, 5, 3])
-    """
-
-    times: Tensor
-    displacement: Tensor
-    velocity: Tensor

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from torchchain import checks
 from torchchain.frames.doubts import here
-from torchchain.frames.record import Contacts, Frame
+from torchchain.frames.record import AXES, Box, Contacts, Frame
 
 LAWS = ("linear", "hertz")
 
@@ -87,6 +88,42 @@ def contact_stiffness(name: str, frame: Frame, law: str) -> Tensor:
     assert contacts.overlap is not None
     assert contacts.normal_force is not None
     return (1.5 if law == "hertz" else 1.0) * contacts.normal_force / contacts.overlap
+
+
+def periods(box: Box | None) -> Tensor:
+    """Lengths of the box along x, y, z, infinite where it is not periodic, (3,)."""
+    if box is None:
+        return torch.full((3,), torch.inf, dtype=torch.float64)
+    return torch.where(torch.tensor(box.periodic) & (box.lengths > 0), box.lengths, torch.inf)
+
+
+def separation(frame: Frame, pairs: Tensor) -> Tensor:
+    """Distance of the centers of pairs, across the box where that is shorter, (pair,)."""
+    side = periods(frame.box)[[AXES.index(axis) for axis in frame.axes]]
+    apart = frame.positions[pairs[:, 1]] - frame.positions[pairs[:, 0]]
+    turns = torch.where(side.isfinite(), (apart / side).round() * side, 0.0)
+    return (apart - turns).square().sum(-1).sqrt()
+
+
+def at_rest(frame: Frame, reference: Frame, law: str) -> Contacts | None:
+    """The contacts in the reference: its own, or those of a frame with overlap and force as the law takes them there.
+
+    Between two particles that move from distance L to L0 the overlap grows by L - L0, and the force as its power 1
+    ("linear") or 3/2 ("hertz"). Walls, which are nowhere in a list, keep theirs.
+    """
+    contacts = frame.contacts
+    if reference.contacts is not None or contacts is None or reference is frame:
+        return reference.contacts if reference.contacts is not None else contacts
+    if contacts.overlap is None:
+        return replace(contacts, normal_force=None) if contacts.normal_force is not None else contacts
+    free = (contacts.pairs >= 0).all(-1)
+    pairs = contacts.pairs.clamp(min=0)
+    moved = torch.where(free, separation(frame, pairs) - separation(reference, pairs), 0.0)
+    overlap, force = contacts.overlap + moved, contacts.normal_force
+    if force is not None:
+        power = 1.5 if law == "hertz" else 1.0
+        force = force * torch.where(contacts.overlap > 0, overlap / contacts.overlap, 1.0).clamp(min=0) ** power
+    return replace(contacts, overlap=overlap, normal_force=force)
 
 
 def fit_units(name: str, frame: Frame, law: str) -> ContactUnits:

@@ -175,8 +175,12 @@ def _replicates(bootstrap: int | None, fit: Fit | None, transfer: BandTransfer) 
     if bootstrap is None:
         return REPLICATES if (fit is None or fit.quick) and blocks >= 4 else 0
     count = checks.integer("bootstrap", bootstrap, 0, 10**4)
-    if count == 1 or (count and blocks < 2):
-        raise checks.fail("bootstrap", "be 0, or at least 2 for at least 2 blocks of realizations", count)
+    if count and blocks < 2:
+        raise checks.fail(
+            "bootstrap", "be 0 for one realization (error bars need runs on at least 2 chains for every source)", count
+        )
+    if count == 1:
+        raise checks.fail("bootstrap", "be 0 or at least 2", count)
     return count
 
 

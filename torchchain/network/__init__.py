@@ -35,6 +35,7 @@ from torchchain.network.modes import (
     softness,
 )
 from torchchain.network.networks import Network
+from torchchain.network.packing_bands import PackingBands, packing_band_energy, packing_bands
 from torchchain.network.packings import Packing, packing, rattlers, subnetwork, without_rattlers
 from torchchain.network.spectra import (
     Spectrum,
@@ -67,6 +68,7 @@ __all__ = [
     "NetworkModes",
     "NetworkTrajectory",
     "Packing",
+    "PackingBands",
     "PlaneWaveEnergy",
     "ShellBands",
     "Softness",
@@ -100,6 +102,8 @@ __all__ = [
     "normal_modes",
     "ordered_density",
     "packing",
+    "packing_band_energy",
+    "packing_bands",
     "particle_energy",
     "plane_wave",
     "plane_wave_energy",

@@ -1,0 +1,105 @@
+"""Bands of packings: shells of |q| for each polarization on plane waves of the box, and one of all other motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.chain.states import Trajectory
+from torchchain.network.networks import Network
+from torchchain.network.wavenumber import POLARIZATIONS, box_wavevectors, plane_wave_energy, shell_energy
+
+REACH = 2.0  # of the longest wavevector by default, over the mean bond length
+
+
+@dataclass(frozen=True)
+class PackingBands:
+    """Equal shells of |q| in (0, largest], for each polarization, and a last band for what is in none of them.
+
+    The last band holds the translation of the whole and all motion that plane waves up to ``largest`` do not make, so
+    that the bands add up to the total energy.
+
+    Attributes:
+        n_shells: per polarization.
+        largest: |q| of the last shell's end.
+        polarizations: ("longitudinal", "transverse"), or ("scalar",).
+    """
+
+    n_shells: int
+    largest: float
+    polarizations: tuple[str, ...]
+
+    @property
+    def n_bands(self) -> int:
+        return self.n_shells * len(self.polarizations) + 1
+
+    @property
+    def edges(self) -> Tensor:
+        """|q|, (n_shells + 1,)."""
+        return torch.linspace(0, self.largest, self.n_shells + 1, dtype=torch.float64)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Of every band: "longitudinal 1", ..., "other"."""
+        return (*(f"{name} {shell + 1}" for name in self.polarizations for shell in range(self.n_shells)), "other")
+
+
+def packing_bands(network: Network, n_shells: int = 4, largest: float | None = None) -> PackingBands:
+    """The bands of a network in a periodic box; see :class:`PackingBands`.
+
+    >>> from torchchain.network import lattice
+    >>> packing_bands(lattice("square", (12, 12), "scalar"), 2).labels
+    ('scalar 1', 'scalar 2', 'other')
+
+    Args:
+        network: periodic along every direction.
+        n_shells: per polarization.
+        largest: |q|; by default 2 over the mean bond length.
+
+    Raises:
+        FieldError: for a shell that holds no wavevector of the box, and waves that particles do not tell apart.
+    """
+    n_shells = checks.integer("n_shells", n_shells, 1, 10**4)
+    if largest is None:
+        if not network.n_bonds:
+            raise checks.fail("bonds", "be at least one for a scale of wavenumbers (or give largest)", 0)
+        largest = REACH / float(network.lengths.mean())
+    largest = checks.number("largest wavenumber", largest, above=0)
+    kinds = POLARIZATIONS if network.n_components > 1 else ("scalar",)
+    bands = PackingBands(n_shells, largest, kinds)
+    lengths = box_wavevectors(network, largest).norm(dim=-1).double().cpu()
+    shell = torch.bucketize(lengths[1:] * (1 - 1e-12), bands.edges) - 1
+    held = torch.bincount(shell, minlength=n_shells)
+    if bool((held == 0).any()):
+        raise checks.fail(
+            "n_shells",
+            "leave a wavevector of the box in every shell",
+            f"{n_shells}, with none in shell {int(held.argmin()) + 1}",
+        )
+    return bands
+
+
+def packing_band_energy(
+    network: Network, trajectory: Trajectory, bands: PackingBands, normalize: bool = True
+) -> Tensor:
+    """Energy in the bands of a packing, (*batch, time, band); see :func:`torchchain.network.plane_wave_energy`.
+
+    Args:
+        network: periodic along every direction.
+        trajectory: displacement and velocity (*batch, time, particle, component).
+        bands: of :func:`packing_bands`.
+        normalize: divide by the total energy.
+    """
+    waves = plane_wave_energy(network, trajectory, bands.largest)
+    shells = shell_energy(waves.lengths, waves.energy, bands.edges).transpose(-2, -1).flatten(-2)
+    other = waves.remainder + waves.energy[..., 0, :].sum(-1)
+    energy = torch.cat([shells, other[..., None]], dim=-1)
+    if not checks.truth("normalize", normalize):
+        return energy
+    total = energy.sum(-1, keepdim=True)
+    bad = ~((total[..., 0] > 0) & total[..., 0].isfinite())
+    checks.first_bad("total energy", "be positive and finite to normalize", total[..., 0], bad, "time")
+    return energy / total
