@@ -210,16 +210,20 @@ def grid_wavevectors(network: Lattice) -> np.ndarray:
 
 
 def dynamical_matrix(network: Lattice, wavevectors: np.ndarray) -> np.ndarray:
-    """K(q) of the uniform lattice, (wavevector, component, component), real and symmetric.
+    """:func:`uniform_stiffness` of a uniform lattice, (wavevector, component, component)."""
+    stiffness, tension = (torch.as_tensor(x).detach().flatten()[0].item() for x in (network.stiffness, network.tension))
+    return uniform_stiffness(network.kind, network.motion, stiffness, tension, wavevectors)
 
-    Sum over half of the neighbors of 2 C (1 - cos(q . r)), from the lattice's stiffness and tension.
+
+def uniform_stiffness(kind: str, motion: str, stiffness: float, tension: float, wavevectors: np.ndarray) -> np.ndarray:
+    """K(q) of a lattice of equal bonds, (wavevector, component, component), real and symmetric.
+
+    Sum over half of the neighbors of 2 C (1 - cos(q . r)).
     """
-    primitive = np.array(PRIMITIVE[network.kind])
-    vectors = np.array(STEPS[network.kind]) @ primitive
-    stiffness = torch.as_tensor(network.stiffness).detach().flatten()[0].item()
-    tension = torch.as_tensor(network.tension).detach().flatten()[0].item()
+    primitive = np.array(PRIMITIVE[kind])
+    vectors = np.array(STEPS[kind]) @ primitive
     weight = 2 * (1 - np.cos(np.asarray(wavevectors) @ vectors.T))
-    if network.motion == "scalar":
+    if motion == "scalar":
         return stiffness * weight.sum(-1)[:, None, None]
     along = vectors[:, :, None] * vectors[:, None, :]
     across = np.eye(len(primitive)) - along

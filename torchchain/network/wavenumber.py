@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.states import Trajectory
-from torchchain.network.lattices import Lattice, reciprocal
+from torchchain.network.lattices import PRIMITIVE, Lattice, reciprocal
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import check_trajectory
 
@@ -55,10 +56,18 @@ def zone(network: Lattice) -> Zone:
     checks.instance("network", network, Lattice)
     if not network.is_periodic:
         raise checks.fail("boundary", "be periodic for wavevectors of a lattice", network.boundary)
-    d = network.dimension
-    vectors = reciprocal(network.primitive.detach()).double().cpu().numpy()
-    turns = np.stack(np.unravel_index(np.arange(network.n_particles), network.shape), axis=1)
-    fraction = turns / np.array(network.shape)
+    found, device = zone_of(network.kind, network.shape), network.bonds.device
+    values = (x.to(network.positions) for x in (found.wavevectors, found.lengths, found.longitudinal))
+    return Zone(found.turns.to(device), *values, found.is_edge.to(device))
+
+
+@lru_cache(maxsize=32)
+def zone_of(kind: str, shape: tuple[int, ...]) -> Zone:
+    """The wavevectors of periodic lattices of a kind and shape, in float64."""
+    primitive = torch.tensor(PRIMITIVE[kind], dtype=torch.float64)
+    d, vectors = len(shape), reciprocal(primitive).numpy()
+    turns = np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=1)
+    fraction = turns / np.array(shape)
     fraction = fraction - np.round(fraction)
     moves = np.array(list(np.ndindex(*(5,) * d))) - 2
     best = np.full(len(turns), np.inf)
@@ -77,11 +86,8 @@ def zone(network: Lattice) -> Zone:
         count[near] += 1
     projector /= count[:, None, None]
     projector[0] = np.eye(d) / d
-    put = lambda x: torch.from_numpy(x).to(network.positions)  # noqa: E731
-    return Zone(
-        torch.from_numpy(turns).to(network.bonds.device), put(folded), put(best), put(projector),
-        torch.from_numpy(count > 1).to(network.bonds.device),
-    )  # fmt: skip
+    put = torch.from_numpy
+    return Zone(put(turns), put(folded), put(best), put(projector), put(count > 1))
 
 
 def transform(network: Lattice, field: Tensor) -> Tensor:
