@@ -57,7 +57,7 @@ def test_names_that_were_public_before():
 
 def test_rooms_as_namespaces():
     assert tc.localization.lyapunov_exponent is tc.lyapunov_exponent
-    assert tc.energy.kinetic_energy is tc.kinetic_energy
+    assert tc.energy.energy_center is tc.energy_center
     assert tc.master.chapman_kolmogorov is tc.chapman_kolmogorov
 
 

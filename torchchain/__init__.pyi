@@ -20,18 +20,12 @@ from torchchain.chain import standing_wave as standing_wave
 from torchchain.checks import FieldError as FieldError
 from torchchain.checks import FieldTypeError as FieldTypeError
 from torchchain.energy import EnergyMatrices as EnergyMatrices
-from torchchain.energy import band_energy as band_energy
 from torchchain.energy import basis_fraction as basis_fraction
 from torchchain.energy import bin_energy as bin_energy
 from torchchain.energy import energy_center as energy_center
 from torchchain.energy import energy_matrices as energy_matrices
 from torchchain.energy import energy_width as energy_width
-from torchchain.energy import kinetic_energy as kinetic_energy
-from torchchain.energy import long_time_band_energy as long_time_band_energy
-from torchchain.energy import particle_energy as particle_energy
 from torchchain.energy import potential_energy as potential_energy
-from torchchain.energy import total_energy as total_energy
-from torchchain.energy import wavenumber_energy as wavenumber_energy
 from torchchain.energy import wavenumber_energy_matrix as wavenumber_energy_matrix
 from torchchain.energy import zero_wavenumber_share as zero_wavenumber_share
 from torchchain.ensemble import BandTransfer as BandTransfer
@@ -92,8 +86,15 @@ from torchchain.modes.localization import weak_disorder_lyapunov as weak_disorde
 from torchchain.network import Network as Network
 from torchchain.network import lattice as lattice
 from torchchain.network import packing as packing
+from torchchain.network.systems import band_energy as band_energy
+from torchchain.network.systems import bond_energy as bond_energy
 from torchchain.network.systems import evolve as evolve
+from torchchain.network.systems import kinetic_energy as kinetic_energy
+from torchchain.network.systems import long_time_band_energy as long_time_band_energy
 from torchchain.network.systems import normal_modes as normal_modes
+from torchchain.network.systems import particle_energy as particle_energy
+from torchchain.network.systems import total_energy as total_energy
+from torchchain.network.systems import wavenumber_energy as wavenumber_energy
 from torchchain.results import RunFolder as RunFolder
 from torchchain.results import open_folder as open
 

@@ -71,8 +71,8 @@ class SceneFlags:
     """scene file (TOML)"""
     n_particles: Annotated[int | None, flag("INT", 256)] = None
     """particles per chain"""
-    boundary: Annotated[str | None, flag(choices.BOUNDARIES, "periodic")] = None
-    """ring, or chain between two walls"""
+    boundary: Annotated[str | None, flag(choices.LATTICE_BOUNDARIES, "periodic")] = None
+    """ring, or chain between two walls; lattices can be free, too"""
     disorder: DisorderFlags = field(default_factory=DisorderFlags)
     excitation: ExcitationFlags = field(default_factory=ExcitationFlags)
     times: TimesFlags = field(default_factory=TimesFlags)
@@ -91,6 +91,16 @@ class SceneFlags:
     """contact damping coefficient"""
     energy_definition: Annotated[str | None, flag(choices.DEFINITIONS, "site")] = None
     """energy of a particle"""
+    lattice: Annotated[str | None, flag(choices.LATTICES)] = None
+    """of springs in one to three dimensions, in place of chains; n_particles follows from its shape"""
+    shape: Annotated[tuple[int, ...] | None, flag("INT ...")] = None
+    """lattices: particles along each axis"""
+    motion: Annotated[str | None, flag(("vector", "scalar"), "vector")] = None
+    """lattices: displacements along all directions, or one"""
+    removed_bonds: Annotated[float | None, flag("FLOAT", 0.0)] = None
+    """lattices: probability that a bond is missing"""
+    position_disorder: Annotated[float | None, flag("FLOAT", 0.0)] = None
+    """lattices: standard deviation of the coordinates of the particles, in spacings"""
     opposite_pairs: Annotated[bool | None, flag(("True", "False"), False)] = None
     """draw chains in pairs of opposite masses: for means that change with the odd part of the disorder, such as widths"""
     plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()

@@ -22,7 +22,12 @@ from torchchain.ensemble.observables import Observable, chosen_observables
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.stages import Stages
 from torchchain.evolvers import start
-from torchchain.modes.spectrum import NormalModes, normal_modes
+from torchchain.evolvers.method import Advance
+from torchchain.modes.spectrum import NormalModes
+from torchchain.network.evolvers import begin
+from torchchain.network.lattices import Lattice
+from torchchain.network.modes import NetworkModes
+from torchchain.network.systems import normal_modes
 from torchchain.threads import single_thread
 
 
@@ -31,12 +36,12 @@ class Chunk:
     """Realizations first, first + 1, ... of a scene, evolved together in windows of times.
 
     :meth:`observe` measures them the cheapest way: on the part of the chains that moves, in the stencil's kernels,
-    in the basis of the modes, or from the states.
+    in the basis of the modes, or from the states, as always for lattices.
     """
 
     scene: Scene
     first: int
-    chain: Chain
+    system: Chain | Lattice
     state: State
     method: str
     options: dict[str, Any]
@@ -44,11 +49,16 @@ class Chunk:
     stages: Stages
     watch: Callable[[Chain, Trajectory], None] | None = None
 
+    @property
+    def _chain(self) -> Chain:
+        assert isinstance(self.system, Chain), "of scenes of chains alone"
+        return self.system
+
     @cached_property
-    def modes(self) -> NormalModes:
+    def modes(self) -> NormalModes | NetworkModes:
         """The normal modes, computed once if anything asks for them."""
         with self.stages("eigen-decomposition"):
-            return normal_modes(self.chain)
+            return normal_modes(self.system)
 
     @cached_property
     def times(self) -> Tensor:
@@ -67,6 +77,8 @@ class Chunk:
             with suppress(PartExceeded):  # the whole chain, then
                 return self._of_part(self.layout.part, entries)
         kinds = {entry.kernel for entry in entries}
+        if self.scene.lattice is not None:
+            return self._of_states(entries)
         if self.method == "chebyshev" and kinds == {"bands"}:
             return self._by_kernel(entries, self._bands_by_kernel)
         if self.method == "chebyshev" and None not in kinds and "bands" not in kinds:
@@ -81,7 +93,7 @@ class Chunk:
         inside = replace(
             self,
             scene=part.scene(self.scene),
-            chain=part.chain(self.chain),
+            system=part.chain(self._chain),
             state=part.state(self.state),
             layout=replace(self.layout, part=None),
             watch=part.check,
@@ -92,24 +104,25 @@ class Chunk:
         """From the stencil's kernels, which leave no states behind."""
         with self.stages("evolution with observables"):
             if self.watch is not None:
-                self.watch(self.chain, start(self.chain, self.state, self.method, **self.options)(self.times[-1:]))
+                self.watch(self._chain, start(self._chain, self.state, self.method, **self.options)(self.times[-1:]))
             found = measure()
         return {entry.name: found[entry.kernel] for entry in entries if entry.kernel is not None}
 
     def _bands_by_kernel(self) -> dict[str, Tensor]:
         n_bands, definition = self.scene.n_bands, self.scene.energy_definition
-        given = self.chain, self.state, self.times, n_bands, True, definition
+        given = self._chain, self.state, self.times, n_bands, True, definition
         return {"bands": fused.band_energy(*given, **self.options)}
 
     def _moments_by_kernel(self) -> dict[str, Tensor]:
-        given = self.chain, self.state, self.times, self.scene.energy_definition
+        given = self._chain, self.state, self.times, self.scene.energy_definition
         return vars(fused.energy_moments(*given, **self.options))
 
     def _bands_by_modes(self) -> Tensor:
         modes, n_bands = self.modes, self.scene.n_bands
+        assert isinstance(modes, NormalModes), "of chains"
         with self.stages("evolution with observables"):
             windows = self.times.split(self.layout.window)
-            bands = [modal_band_energy(self.chain, self.state, part, n_bands, modes=modes) for part in windows]
+            bands = [modal_band_energy(self._chain, self.state, part, n_bands, modes=modes) for part in windows]
             return torch.cat(bands, dim=-2)
 
     def _of_states(self, entries: list[Observable]) -> dict[str, Tensor]:
@@ -118,7 +131,7 @@ class Chunk:
             with self.stages("observables"):
                 for entry in entries:
                     assert entry.compute is not None
-                    values = entry.compute(self.scene, self.chain, trajectory)
+                    values = entry.compute(self.scene, self.system, trajectory)
                     parts[entry.name].append(self._checked(entry, values, len(trajectory.times)))
         return {entry.name: torch.cat(parts[entry.name], dim=-len(entry.axes)) for entry in entries}
 
@@ -126,31 +139,35 @@ class Chunk:
         """The states at consecutive windows of the scene's times."""
         options = {"modes": self.modes, **self.options} if self.method == "modes" else self.options
         with self.stages("evolution"):
-            advance = start(self.chain, self.state, self.method, **options)
+            advance: Advance
+            if isinstance(self.system, Lattice):
+                advance = begin(self.system, self.state, self.method, **options)
+            else:
+                advance = start(self.system, self.state, self.method, **options)
         for window in self.times.split(self.layout.window):
             with self.stages("evolution"):
                 trajectory = advance(window)
             if self.watch is not None:
-                self.watch(self.chain, trajectory)
+                self.watch(self._chain, trajectory)
             yield trajectory
 
     def _average(self, entry: Observable) -> Tensor:
         """An observable that needs no times, a group of realizations after the other."""
         assert entry.average is not None
         group = self.layout.group
-        if len(self.chain.masses) > group:
-            firsts = range(0, len(self.chain.masses), group)
+        if len(self.system.masses) > group:
+            firsts = range(0, len(self.system.masses), group)
             return torch.cat([self._some(first, first + group)._average(entry) for first in firsts])
         with single_thread():
             modes = self.modes
             with self.stages("long-time average"):
-                return self._checked(entry, entry.average(self.scene, self.chain, self.state, modes), 0)
+                return self._checked(entry, entry.average(self.scene, self.system, self.state, modes), 0)
 
     def _checked(self, entry: Observable, values: Tensor, n_times: int) -> Tensor:
         """The values, if their shape is that of the observable's axes."""
-        n = self.scene.n_particles
-        lengths = {"time": n_times, "particle": n, "wavenumber": n // 2 + 1, "band": self.scene.n_bands}
-        shape = (*self.state.displacement.shape[:-1], *(lengths[axis] for axis in entry.axes))
+        lengths = {**self.scene.lengths, "time": n_times}
+        inner = 1 if isinstance(self.system, Chain) else 2  # axes of a state
+        shape = (*self.state.displacement.shape[:-inner], *(lengths[axis] for axis in entry.axes))
         checks.instance(f"observable {entry.name}", values, Tensor)
         if tuple(values.shape) != shape:
             raise checks.fail(f"observable {entry.name}", f"give shape {shape}", f"shape {tuple(values.shape)}")
@@ -158,11 +175,11 @@ class Chunk:
 
     def _some(self, low: int, high: int) -> Chunk:
         """Some of the realizations."""
-        chain, state, stiffness = self.chain, self.state, torch.as_tensor(self.chain.stiffness)
+        chain, state, stiffness = self._chain, self.state, torch.as_tensor(self._chain.stiffness)
         return replace(
             self,
             first=self.first + low,
-            chain=replace(
+            system=replace(
                 chain, masses=chain.masses[low:high], stiffness=stiffness[low:high] if stiffness.ndim > 1 else stiffness
             ),
             state=State(state.displacement[low:high], state.velocity[low:high]),

@@ -42,6 +42,8 @@ def estimate_disorder(
     """
     checks.instance("transfer", transfer, BandTransfer)
     scene = transfer.scene
+    if scene is not None and scene.lattice is not None:
+        raise checks.fail("transfer", "be of chains", f"{scene.lattice} lattices")
     if n_particles is None:
         if scene is None:
             raise checks.fail("n_particles", "be given for a transfer without a scene", "None")

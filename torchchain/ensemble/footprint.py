@@ -10,7 +10,6 @@ import torch
 from torchchain import checks
 from torchchain.ensemble.observables import chosen_observables
 from torchchain.ensemble.scene import Scene
-from torchchain.evolvers import METHODS
 from torchchain.memory import gigabytes, memory
 
 STATES = 10  # arrays of the size of the states that evolution and observables hold at once
@@ -40,15 +39,17 @@ def footprint(scene: Scene, method: str, fused: bool) -> Footprint:
         method: a name of ``evolvers.METHODS``, or "auto" for what every method takes at least.
         fused: whether the stencil's kernels measure without storing states.
     """
-    rows, n = max(1, len(scene.tones)), scene.n_particles
+    rows, n = max(1, len(scene.tones)), scene.n_particles * scene.n_components
     observables = chosen_observables(scene.observables)
-    lengths = {"time": len(scene.times), "particle": n, "wavenumber": n // 2 + 1, "band": scene.n_bands}
-    numbers = sum(math.prod(lengths[axis] for axis in entry.axes) for entry in observables)
+    numbers = sum(math.prod(scene.lengths[axis] for axis in entry.axes) for entry in observables)
     averages = any(not entry.in_time for entry in observables)
-    matrices = max(0 if method == "auto" else METHODS[method].matrices, METHODS["modes"].matrices * averages)
-    return Footprint(
-        8 * matrices * n * n, 8 * rows * n * (FUSED if fused or method == "auto" else STATES), 8 * rows * numbers
+    matrices = max(
+        0 if method == "auto" else scene.methods[method].matrices, scene.methods["modes"].matrices * averages
     )
+    arrays = FUSED if fused or method == "auto" else STATES
+    if scene.lattices is not None:
+        arrays = STATES + math.ceil(4 * scene.lattices.n_bonds / scene.n_particles)
+    return Footprint(8 * matrices * n * n, 8 * rows * n * arrays, 8 * rows * numbers)
 
 
 def check(scene: Scene, one: Footprint, window: int, nodes: int, device: torch.device) -> None:

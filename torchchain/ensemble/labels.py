@@ -12,6 +12,7 @@ from torchchain._version import __version__
 from torchchain.chain.scaling import Scaling
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import Moments
+from torchchain.network.random_lattices import RandomLattices
 
 
 def ordered_error(is_ordered: bool, moment: Moments) -> Tensor:
@@ -38,12 +39,37 @@ def coordinates(scene: Scene, axes: set[str]) -> dict[str, Any]:
         "band": ("band", np.arange(1, scene.n_bands + 1), {"long_name": "wavenumber band r"}),
         "wavenumber": ("wavenumber", 2 * np.pi / n * np.arange(n // 2 + 1), k),
     }
+    if scene.lattices is not None:
+        every |= _of_lattices(scene, scene.lattices)
     chosen = time_coordinates(scene.times, scene.si) if "time" in axes else {}
-    chosen |= {name: every[name] for name in every if name in axes}
+    chosen |= {name: values for name, values in every.items() if values[0] in axes}
     if scene.si is not None and "particle" in axes:
         place = scene.si.spacing * np.arange(1, n + 1)
         chosen["place_si"] = ("particle", place, {"units": "m", "long_name": "rest position of the particle"})
     return chosen
+
+
+def _of_lattices(scene: Scene, lattices: RandomLattices) -> dict[str, Any]:
+    """Coordinates that lattices have in place of a chain's, or besides."""
+    distance = {"units": "particle distance"}
+    found: dict[str, Any] = {
+        "tone": ("tone", np.array(scene.tones, dtype=np.int64), {"long_name": "band of the plane wave"}),
+        "ring": ("ring", np.arange(scene.lengths["ring"]), {**distance, "long_name": "distance from the source"}),
+    }
+    for axis, place in zip("xyz", lattices.ordered.positions.numpy().T, strict=False):
+        found[axis] = ("particle", place, {**distance, "long_name": f"rest position {axis}"})
+    if scene.needs_bands:
+        bands = lattices.bands(scene.n_bands)
+        middle = (bands.edges[1:] + bands.edges[:-1]).numpy() / 2
+        found["band"] = (
+            "band",
+            np.arange(1, scene.n_bands + 1),
+            {"long_name": "band r: shell of |q| and polarization"},
+        )
+        found["polarization"] = ("band", np.repeat(bands.polarizations, bands.n_shells), {"long_name": "polarization"})
+        k = {"units": "rad / particle distance", "long_name": "|q| in the middle of the shell"}
+        found["shell"] = ("band", np.tile(middle, len(bands.polarizations)), k)
+    return found
 
 
 def scene_attributes(scene: Scene) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def layout(scene: Scene, method: str, device: torch.device) -> Layout:
     Raises:
         FieldError: if one realization at a time takes more memory than there is.
     """
-    fused = device.type == "cpu" and is_fused(method, scene.observables)
+    fused = device.type == "cpu" and scene.lattice is None and is_fused(method, scene.observables)
     part = moving_part(scene, method)
     cut = scene if part is None or fused else part.scene(scene)
     one = replace(footprint.footprint(cut, method, fused), results=footprint.footprint(scene, method, fused).results)
@@ -85,6 +85,7 @@ def layout(scene: Scene, method: str, device: torch.device) -> Layout:
         largest = CHUNK_WORK // points
     else:
         few = max(1, min(few, together // scene.n_particles))  # masses of the whole chains
+        few = 1 if scene.position_disorder else few  # places have no axis of realizations
         group = largest = min(few, (one.matrices + together) // held)
     group = -(-max(1, group) // scene.sample_size) * scene.sample_size  # whole samples
     return Layout(device, fused, part, window, group, held, largest)

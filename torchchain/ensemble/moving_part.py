@@ -109,7 +109,9 @@ def moving_part(scene: Scene, method: str | None = None) -> MovingPart | None:
         scene: what is wanted.
         method: that evolves the chains; None for any that stores states.
     """
-    if not isinstance(scene.excitation, Impulse) or not all(o.local for o in chosen_observables(scene.observables)):
+    if scene.lattice is not None or not isinstance(scene.excitation, Impulse):
+        return None
+    if not all(o.local for o in chosen_observables(scene.observables)):
         return None
     n, site, end = scene.n_particles, scene.excitation.site - 1, float(scene.times[-1])
     distance = math.ceil(_front_speed(scene) * end + 9 * (1 + end) ** (1 / 3) + 8)

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.chain import Chain
-from torchchain.chain.excitation import Impulse
 from torchchain.chain.states import State, Trajectory
-from torchchain.energy import wavenumber
-from torchchain.energy.space import energy_center, energy_width, particle_energy, total_energy
-from torchchain.modes.spectrum import NormalModes
+from torchchain.energy.space import energy_center, energy_width
+from torchchain.network import energy as spreading
+from torchchain.network import systems
+from torchchain.network.lattices import Lattice
+from torchchain.network.trajectories import NetworkTrajectory
 
 if TYPE_CHECKING:
     from torchchain.ensemble.scene import Scene
 
-AXES = ("time", "particle", "wavenumber", "band")
+AXES = ("time", "particle", "wavenumber", "band", "ring")
+CHAINS, LATTICES = ("chain",), ("lattice",)
 KERNELS = ("bands", "total", "center", "width")
 
 
@@ -33,7 +35,7 @@ class Observable:
         axes: after those of realization and tone, from ``AXES``; "time" first if it is there.
         unit: in the library's units, "1" for none.
         label: a few words for axes of figures and files.
-        compute: ``(scene, chain, trajectory)`` to a tensor (realization, [tone,] *axes), called with windows of times.
+        compute: ``(scene, chain or lattice, trajectory)`` to a tensor (realization, [tone,] *axes), called with windows of times.
         average: in place of ``compute`` for what needs no times: ``(scene, chain, state, modes)`` to the same.
         local: whether particles at rest add nothing, so that they may be left out.
         is_place: whether the values count particles, from 1.
@@ -43,6 +45,7 @@ class Observable:
         passes: elementwise passes over a state that computing it takes, for the plan's estimate of time.
         kernel: what the stencil's kernels measure it as without storing states: "bands", or "total", "center" or
             "width" of the energy, which come together.
+        kinds: of scenes that have it: of a "chain", of a "lattice".
 
     Example:
         >>> speed = tc.Observable("speed", ("time",), "initial overlap / time", "largest speed",
@@ -55,8 +58,8 @@ class Observable:
     axes: tuple[str, ...]
     unit: str
     label: str
-    compute: Callable[[Scene, Chain, Trajectory], Tensor] | None = None
-    average: Callable[[Scene, Chain, State, NormalModes], Tensor] | None = None
+    compute: Callable[[Scene, Any, Trajectory], Tensor] | None = None
+    average: Callable[[Scene, Any, State, Any], Tensor] | None = None
     local: bool = False
     is_place: bool = False
     wavenumbers: bool = False
@@ -64,6 +67,7 @@ class Observable:
     damped: bool = True
     passes: float = 20.0
     kernel: str | None = None
+    kinds: tuple[str, ...] = CHAINS + LATTICES
 
     def __post_init__(self) -> None:
         checks.instance("observable.name", self.name, str)
@@ -84,38 +88,59 @@ class Observable:
         return self.compute is not None
 
 
-def _energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
-    return particle_energy(chain, trajectory, scene.energy_definition)
+System = Chain | Lattice
 
 
-def _source_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
-    site = scene.excitation.site if isinstance(scene.excitation, Impulse) else 1
-    return _energy(scene, chain, trajectory)[..., site - 1]
+def _energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
+    return systems.particle_energy(chain, trajectory, scene.energy_definition)
 
 
-def _dissipated(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+def _source_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
+    return _energy(scene, chain, trajectory)[..., scene.site - 1]
+
+
+def _dissipated(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
+    if isinstance(chain, Lattice):
+        return systems.total_energy(chain, _start(scene, chain, trajectory)) - systems.total_energy(chain, trajectory)
     return torch.zeros_like(trajectory.displacement[..., 0]) if trajectory.dissipated is None else trajectory.dissipated
 
 
-def _openings(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+def _openings(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
     none = torch.zeros_like(trajectory.displacement[..., 0])
     return none if trajectory.openings is None else trajectory.openings.to(none)
 
 
-def _band_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+def _band_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
     """Share of the energy, of that at the start where damping takes some of it."""
-    share = wavenumber.band_energy(chain, trajectory, scene.n_bands, scene.damping == 0, scene.energy_definition)
+    share = systems.band_energy(chain, trajectory, scene.n_bands, scene.damping == 0, _of_wavenumbers(scene))
     if scene.damping == 0:
         return share
-    state = scene.state(chain)
-    begin = Trajectory(trajectory.times[:1], state.displacement[..., None, :], state.velocity[..., None, :])
-    return share / total_energy(chain, begin)[..., None]
+    return share / systems.total_energy(chain, _start(scene, chain, trajectory))[..., None]
 
 
-def _long_time_band_energy(scene: Scene, chain: Chain, state: State, modes: NormalModes) -> Tensor:
-    return wavenumber.long_time_band_energy(
-        chain, state, scene.n_bands, modes=modes, definition=scene.energy_definition
-    )
+def _start(scene: Scene, chain: System, trajectory: Trajectory) -> Trajectory:
+    """The start as a trajectory of one time."""
+    state, axis, kind = scene.state(chain), -1, Trajectory
+    if isinstance(chain, Lattice):
+        axis, kind = -2, NetworkTrajectory
+    fields = (x.unsqueeze(axis - 1) for x in (state.displacement, state.velocity))
+    return kind(trajectory.times[:1], *fields)
+
+
+def _long_time_band_energy(scene: Scene, chain: System, state: State, modes: Any) -> Tensor:
+    definition = _of_wavenumbers(scene)
+    return systems.long_time_band_energy(chain, state, scene.n_bands, modes=modes, definition=definition)
+
+
+def _of_wavenumbers(scene: Scene) -> str:
+    """The definition of energies over wavenumbers; lattices have one."""
+    return scene.energy_definition if scene.lattice is None else "site"
+
+
+def _profile(scene: Scene, network: Lattice, trajectory: Trajectory) -> Tensor:
+    assert scene.lattices is not None, "of lattices alone"
+    edges = scene.lattices.ring_edges(scene.site)
+    return spreading.radial_profile(network, _energy(scene, network, trajectory), scene.site, edges)
 
 
 _JOULE = "contact stiffness * initial overlap^2"
@@ -151,11 +176,11 @@ for _one in (
     ),
     Observable(
         "center", ("time",), "particle", "center of energy R", lambda s, c, t: energy_center(_energy(s, c, t)),
-        local=True, is_place=True, passes=18, kernel="center",
+        local=True, is_place=True, passes=18, kernel="center", kinds=CHAINS,
     ),
     Observable(
         "displacement", ("time", "particle"), "initial overlap", "displacement", lambda s, c, t: t.displacement,
-        local=True, passes=2,
+        local=True, passes=2, kinds=CHAINS,
     ),
     Observable("dissipated", ("time",), _JOULE, "energy lost to contact damping so far", _dissipated, passes=0),
     Observable("energy", ("time", "particle"), _JOULE, "energy per particle", _energy, local=True, passes=16),
@@ -163,21 +188,38 @@ for _one in (
         "long_time_band_energy", ("band",), "1", "infinite-time average of the share of the energy in a band",
         average=_long_time_band_energy, wavenumbers=True, bands=True, damped=False,
     ),
-    Observable("openings", ("time",), "1", "contacts that were open at any step so far", _openings, passes=0),
+    Observable(
+        "front", ("time",), "particle distance", "radius about the source that holds 0.99 of the energy",
+        lambda s, c, t: spreading.energy_front(c, _energy(s, c, t), s.site), kinds=LATTICES,
+    ),
+    Observable(
+        "openings", ("time",), "1", "contacts that were open at any step so far", _openings, passes=0, kinds=CHAINS
+    ),
+    Observable(
+        "radial_profile", ("time", "ring"), _JOULE, "energy in rings about the source", _profile, kinds=LATTICES
+    ),
+    Observable(
+        "radius", ("time",), "particle distance", "mean distance R of the energy from the source",
+        lambda s, c, t: spreading.energy_radius(c, _energy(s, c, t), s.site), kinds=LATTICES,
+    ),
     Observable(
         "source_energy", ("time",), _JOULE, "energy of the source particle", _source_energy, local=True, passes=14
     ),
     Observable(
-        "total_energy", ("time",), _JOULE, "total energy", lambda s, c, t: total_energy(c, t), local=True, passes=12,
+        "spread", ("time",), "particle distance^2", "mean squared distance r^2 of the energy from the source",
+        lambda s, c, t: spreading.energy_spread(c, _energy(s, c, t), s.site), kinds=LATTICES,
+    ),
+    Observable(
+        "total_energy", ("time",), _JOULE, "total energy", lambda s, c, t: systems.total_energy(c, t), local=True, passes=12,
         kernel="total",
     ),
     Observable(
         "wavenumber_energy", ("time", "wavenumber"), _JOULE, "energy at |k|",
-        lambda s, c, t: wavenumber.wavenumber_energy(c, t, s.energy_definition), wavenumbers=True, passes=30,
+        lambda s, c, t: systems.wavenumber_energy(c, t, s.energy_definition), wavenumbers=True, passes=30, kinds=CHAINS,
     ),
     Observable(
         "width", ("time",), "particle^2", "mean squared width r^2", lambda s, c, t: energy_width(_energy(s, c, t)),
-        local=True, passes=22, kernel="width",
+        local=True, passes=22, kernel="width", kinds=CHAINS,
     ),
 ):  # fmt: skip
     register_observable(_one)

@@ -13,11 +13,11 @@ from typing import Any
 import torch
 
 from torchchain import checks
+from torchchain.ensemble.lattice_facts import LatticeFacts
 from torchchain.ensemble.layout import Layout, layout
-from torchchain.ensemble.predictions import TRIG, Facts, cost, error_of, settle
+from torchchain.ensemble.predictions import TRIG, Facts, cost, error_of, facts_of, settle
 from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.scene import Scene
-from torchchain.evolvers import METHODS
 from torchchain.threads import single_thread
 
 ARTIFACT = "master equation"
@@ -108,7 +108,7 @@ class Plan(Printed):
         ]
         return {
             "method": f"{replace(best, dtype=torch.float64)}, {str(self.dtype).removeprefix('torch.')}, "
-            f"{self.scene.contact} contacts",
+            + (f"{self.scene.contact} contacts" if self.scene.lattice is None else "linear bonds"),
             "error": f"{self.predicted_error:.1e} predicted, tolerance {self.tolerance:.1e}",
             "time": f"{self.predicted_seconds:.2g} s predicted",
             "moving": f"{self.reach} of {self.scene.n_particles} particles",
@@ -147,16 +147,16 @@ def plan(scene: Scene, stand_in: StandIn | None = None) -> Plan:
 
 
 def _plan(scene: Scene, stand_in: StandIn | None) -> Plan:
-    facts = Facts(scene if scene.contact != "auto" else replace(scene, contact="linear"))
+    facts = facts_of(scene if scene.contact != "auto" else replace(scene, contact="linear"))
     tolerance, reasons = _tolerance(scene)
     scene, facts, why = _settled(scene, facts, tolerance)
-    layouts = {name: _layout(name, scene) for name in METHODS if _can(name, scene)}
+    layouts = {name: _layout(name, scene) for name in scene.methods if _can(name, scene)}
     usable = {name: found for name, found in layouts.items() if found is not None}
     if not usable:
         raise checks.fail("method", "treat the scene's contact, boundary, damping and size", "none")
     choices = []
     for name, cut in usable.items():
-        for dtype in (torch.float64, torch.float32)[: 1 + METHODS[name].single_precision]:
+        for dtype in (torch.float64, torch.float32)[: 1 + scene.methods[name].single_precision]:
             options, error = settle(name, facts, tolerance, dtype)
             work, seconds = _seconds(name, facts, options, dtype, cut)
             choices.append(Choice(name, options, error, work, seconds, tolerance, dtype))
@@ -173,17 +173,19 @@ def _plan(scene: Scene, stand_in: StandIn | None) -> Plan:
             f"be at least {nearest.predicted_error:.1e}, what method '{nearest.method}' reaches here",
             tolerance,
         )
-    loaded = [choice for choice in good if choice.method == ARTIFACT or not METHODS[choice.method].compiled]
+    loaded = [choice for choice in good if choice.method == ARTIFACT or not scene.methods[choice.method].compiled]
     best = loaded[0] if loaded and loaded[0].cost < SMALL_WORK else good[0]
     reasons = [*reasons, *why, *_method_reasons(best, good, facts, usable), *remarks]
     return Plan(
         scene, best.method, best.options, best.dtype, best.allowed, best.predicted_error, best.predicted_seconds,
-        math.ceil(facts.moving()) if facts.part is None else facts.n, tuple(reasons),
+        facts.n if isinstance(facts, Facts) and facts.part is not None else math.ceil(facts.moving()), tuple(reasons),
         tuple(choice for choice in choices if choice is not best), best.cost,
     )  # fmt: skip
 
 
-def _seconds(name: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, cut: Layout) -> tuple[float, float]:
+def _seconds(
+    name: str, facts: Facts | LatticeFacts, options: dict[str, Any], dtype: torch.dtype, cut: Layout
+) -> tuple[float, float]:
     """Seconds of one nominal core, and wall time here."""
     chunk = min(cut.group if not cut.fused else max(cut.group, cut.largest), max(1, facts.chains // 4))
     work = facts.chains * cost(name, facts, options, dtype, chunk)
@@ -219,12 +221,12 @@ def forecast(scene: Scene, how: Mapping[str, Any], spent: float, statistical: fl
         predicted_seconds, seconds, predicted_error, statistical_error; no prediction for methods that no plan weighs.
     """
     measured = {"seconds": spent, "statistical_error": statistical}
-    if how["method"] not in METHODS or not METHODS[how["method"]].candidate:
+    if how["method"] not in scene.methods or not scene.methods[how["method"]].candidate:
         return measured
     options = json.loads(how["method_options"])
     dtype = torch.float32 if options.pop("dtype", "") == "float32" else torch.float64
     with single_thread():
-        facts = Facts(scene)
+        facts = facts_of(scene)
         suggested, error = settle(how["method"], facts, _tolerance(scene)[0], dtype)
         options = {**suggested, **options}
         if options != suggested:
@@ -247,7 +249,7 @@ def resolved(scene: Scene) -> Scene:
     if scene.contact != "auto":
         return scene
     with single_thread():
-        return _settled(scene, Facts(replace(scene, contact="linear")), _tolerance(scene)[0])[0]
+        return _settled(scene, facts_of(replace(scene, contact="linear")), _tolerance(scene)[0])[0]
 
 
 def statistical_error(scene: Scene) -> float:
@@ -268,8 +270,12 @@ def _tolerance(scene: Scene) -> tuple[float, list[str]]:
     ]
 
 
-def _settled(scene: Scene, facts: Facts, tolerance: float) -> tuple[Scene, Facts, list[str]]:
+def _settled(
+    scene: Scene, facts: Facts | LatticeFacts, tolerance: float
+) -> tuple[Scene, Facts | LatticeFacts, list[str]]:
     """The scene with its contact law, what it takes, and why."""
+    if isinstance(facts, LatticeFacts):
+        return scene, facts, [f"lattices of {facts.n} unknowns and {facts.n_bonds} bonds"]
     size = f"elongation about {facts.elongation:.1e} of the overlap, force off by {100 * facts.deviation:.1e} %"
     if scene.contact != "auto":
         return (
@@ -290,8 +296,8 @@ def _settled(scene: Scene, facts: Facts, tolerance: float) -> tuple[Scene, Facts
 
 def _can(name: str, scene: Scene) -> bool:
     """Whether the plan weighs the method for the scene."""
-    entry = METHODS[name]
-    fits = entry.candidate and scene.boundary in entry.boundaries and scene.contact in entry.contacts
+    entry = scene.methods[name]
+    fits = entry.candidate and scene.boundary in (*entry.boundaries, "free") and scene.contact in entry.contacts
     if scene.damping > 0:
         return fits and entry.damped
     if "rtol" in entry.options and scene.contact == "linear":
@@ -307,8 +313,10 @@ def _layout(name: str, scene: Scene) -> Layout | None:
         return None
 
 
-def _method_reasons(best: Choice, good: list[Choice], facts: Facts, layouts: Mapping[str, Layout]) -> list[str]:
-    reasons = [] if best.method == ARTIFACT else [f"'{best.method}': {METHODS[best.method].summary}"]
+def _method_reasons(
+    best: Choice, good: list[Choice], facts: Facts | LatticeFacts, layouts: Mapping[str, Layout]
+) -> list[str]:
+    reasons = [] if best.method == ARTIFACT else [f"'{best.method}': {facts.scene.methods[best.method].summary}"]
     if best is not good[0]:
         reasons.append(f"'{good[0]}' would be faster, but {SMALL_WORK:g} s of work are not worth loading its kernels")
     elif len(good) > 1:
@@ -316,10 +324,12 @@ def _method_reasons(best: Choice, good: list[Choice], facts: Facts, layouts: Map
         reasons.append(f"next best '{good[1]}' is predicted to take {ratio:.1f} times as long")
     if best.dtype == torch.float32:
         reasons.append("float32 is accurate enough here, and its loops are faster")
-    if facts.part is not None:
+    if isinstance(facts, Facts) and facts.part is not None:
         n, whole = facts.n, facts.scene.n_particles
         reasons.append(f"the wave reaches {n} of {whole} particles by the last time: the others are left out")
     if best.method != ARTIFACT:
         cut = layouts[best.method].chunks(facts.chains)
-        reasons.append(f"chains {facts.chains}, in chunks of {min(cut.size, facts.chains)}, {cut.workers} side by side")
+        reasons.append(
+            f"{facts.scene.kind}s {facts.chains}, in chunks of {min(cut.size, facts.chains)}, {cut.workers} side by side"
+        )
     return reasons

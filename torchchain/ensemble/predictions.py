@@ -11,6 +11,7 @@ from torchchain.chain.amplitude import elongation_estimate, force_deviation
 from torchchain.chain.chain import Chain
 from torchchain.chain.excitation import Impulse
 from torchchain.chain.states import State
+from torchchain.ensemble.lattice_facts import LatticeFacts
 from torchchain.ensemble.moving_part import moving_part
 from torchchain.ensemble.observables import chosen_observables, is_fused
 from torchchain.ensemble.scene import Scene
@@ -160,8 +161,17 @@ def _mean_power(chain: Chain, state: State, power: int) -> float:
 # --------------------------------------------------------------------------------------------------------------- errors
 
 
-def settle(method: str, facts: Facts, tolerance: float, dtype: torch.dtype) -> tuple[dict[str, Any], float]:
+def facts_of(scene: Scene) -> Facts | LatticeFacts:
+    """What the predictions need to know of a scene."""
+    return Facts(scene) if scene.lattice is None else LatticeFacts(scene)
+
+
+def settle(
+    method: str, facts: Facts | LatticeFacts, tolerance: float, dtype: torch.dtype
+) -> tuple[dict[str, Any], float]:
     """The coarsest options of a method that keep to the tolerance, and the error predicted for them."""
+    if isinstance(facts, LatticeFacts):
+        return facts.settle(method, tolerance)
     entry, options = METHODS[method], {}
     if "accuracy" in entry.options:
         options = {"accuracy": max(1e-13, min(1e-4, tolerance / 20))}
@@ -176,8 +186,10 @@ def settle(method: str, facts: Facts, tolerance: float, dtype: torch.dtype) -> t
     return options, error_of(method, facts, options, dtype)
 
 
-def error_of(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype) -> float:
+def error_of(method: str, facts: Facts | LatticeFacts, options: dict[str, Any], dtype: torch.dtype) -> float:
     """Predicted error of a method, relative to the scale of the observables."""
+    if isinstance(facts, LatticeFacts):
+        return facts.error_of(method, options)
     entry, eps, phase = METHODS[method], EPS[dtype], facts.limit * facts.end
     if entry.order_in_step is not None:
         walk = math.sqrt(entry.forces_per_step * facts.end / options["step"])  # of the rounding errors of the steps
@@ -229,8 +241,10 @@ DAMP, LOOP = 1.2e-9, 2.9e-8  # contact damping over a step, per particle; starti
 CALLS = 1200  # small operations of a chunk of chains
 
 
-def cost(method: str, facts: Facts, options: dict[str, Any], dtype: torch.dtype, chunk: int) -> float:
-    """Seconds of a chain on one nominal core, in chunks of so many."""
+def cost(method: str, facts: Facts | LatticeFacts, options: dict[str, Any], dtype: torch.dtype, chunk: int) -> float:
+    """Seconds of a chain or lattice on one nominal core, in chunks of so many."""
+    if isinstance(facts, LatticeFacts):
+        return facts.cost(method, options)
     entry, n = METHODS[method], facts.n
     if "accuracy" in entry.options:
         seconds = _chebyshev(facts, options["accuracy"])

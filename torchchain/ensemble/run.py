@@ -28,7 +28,6 @@ from torchchain.ensemble.ranks import ALONE, Ranks
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.statistics import EnsembleMoments, merged
-from torchchain.evolvers import METHODS
 from torchchain.threads import map_in_order, single_thread
 
 Measured = TypeVar("Measured")
@@ -55,15 +54,15 @@ class Run:
         options = dict(self.options)
         dtype = PRECISIONS[options.pop("dtype", "float64")]
         with single_thread(), stages("masses"):
-            chain = self.scene.chain(numbers, self.layout.device, dtype)
-            state = self.scene.state(chain)
-        return Chunk(self.scene, numbers[0], chain, state, self.method, options, self.layout, stages)
+            system = self.scene.system(numbers, self.layout.device, dtype)
+            state = self.scene.state(system)
+        return Chunk(self.scene, numbers[0], system, state, self.method, options, self.layout, stages)
 
 
 def check_settings(scene: Scene, method: str, options: Any, device: str | torch.device) -> torch.device:
     """The device; an error, before the plan draws a chain, for what no run of the scene can do."""
     checks.instance("scene", scene, Scene)
-    checks.choice("method", method, ("auto", *METHODS))
+    checks.choice("method", method, ("auto", *scene.methods))
     checks.instance("options", options, dict, type(None))
     checks.choice("dtype", (options or {}).get("dtype", "float64"), PRECISIONS)
     device = checks.device("device", device)
@@ -148,7 +147,7 @@ def _measured(
         with single_thread():
             return numbers, measure(chunk), spent.seconds
 
-    with progress.bar("chains", every, "chain", shown, every - wanted) as bar:
+    with progress.bar(f"{run.scene.kind}s", every, run.scene.kind, shown, every - wanted) as bar:
         for done, measured, seconds in map_in_order(work, _chunks(numbers, cut.size), cut.workers):
             stages.add(seconds)
             yield done[0], measured
@@ -167,7 +166,7 @@ def _chunks(numbers: Sequence[range], size: int) -> Iterator[range]:
 
 def check_amplitude(scene: Scene) -> None:
     """An error for linear contacts that the start would open, a :class:`LinearityWarning` for large amplitudes."""
-    if scene.contact != "linear":
+    if scene.contact != "linear" or scene.lattice is not None:  # bonds of lattices never open
         return
     chain = scene.chain([0])
     state = scene.state(chain)
@@ -263,7 +262,7 @@ def ensemble_moments(
 def _moments_of(chunk: Chunk, cut: tuple[int, int, int]) -> EnsembleMoments:
     """A chunk's observables and masses, reduced."""
     measured = {name: values.cpu().double() for name, values in chunk.observe(chunk.scene.observables).items()}
-    masses = chunk.chain.masses.cpu().numpy()  # NumPy sums each row by itself
+    masses = chunk.system.masses.cpu().numpy()  # NumPy sums each row by itself
     measured["mass_moments"] = torch.from_numpy(np.stack([masses.mean(-1), np.square(masses).mean(-1)], axis=-1))
     part = EnsembleMoments(*cut)
     with chunk.stages("statistics"):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +24,57 @@ from torchchain.chain.states import State
 from torchchain.energy.bands import center_tones, check_bands
 from torchchain.ensemble.observables import OBSERVABLES, chosen_observables
 from torchchain.ensemble.printed import Printed
+from torchchain.evolvers import METHODS, Method
+from torchchain.network.evolvers import METHODS as NETWORK_METHODS
+from torchchain.network.lattices import BOUNDARIES as LATTICE_BOUNDARIES
+from torchchain.network.lattices import Lattice
+from torchchain.network.random_lattices import RandomLattices
 
 EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse, "standing_wave": StandingWave}
 LARGEST_CHAIN = 10**8
 MOST_TIMES = 10**7
 LATEST_TIME = 1e12
+OF_LATTICES = {"shape": None, "motion": "vector", "removed_bonds": 0.0, "position_disorder": 0.0}
+"""Fields that lattices alone have, with their defaults."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene(Printed):
-    """An ensemble of chains, how they are set in motion, and what is to be measured. The defaults are the paper's.
+    """An ensemble of chains or lattices, how they are set in motion, and what is to be measured.
+
+    The defaults are the paper's. With ``lattice`` the scene is of lattices, and of the fields of chains ``contact`` is
+    "linear" and ``si`` None:
+
+    ==================  ===============================================  =================================================
+    field               of chains                                        of lattices
+    ==================  ===============================================  =================================================
+    n_particles         N                                                left out: the product of ``shape``
+    boundary            "periodic" or "fixed"                            "periodic", "fixed" or "free"
+    n_bands             equal bands of |k|, a divisor of N/2             equal shells of |q| times polarizations (even for
+                                                                         motion "vector"), the longitudinal ones first
+    tones               of standing waves, k = 2 pi tone / N             bands whose plane wave starts: that nearest to the
+                                                                         middle of the shell, along its polarization
+    Impulse             of one particle                                  the same, along the first axis
+    damping             of contacts                                      of bonds
+    energy_definition   "site" or "bond"                                 "bond" in space, "site" over wavevectors
+    shape, motion,      none                                             see below
+    removed_bonds,
+    position_disorder
+    ==================  ===============================================  =================================================
+
+    >>> import torchchain as tc
+    >>> scene = tc.Scene(lattice="triangular", shape=(12, 12), n_bands=8, disorder=tc.Disorder(strength=0.2), times=[0, 5])
+    >>> scene.n_particles, tc.simulate(scene)["band_energy"].shape
+    (144, (8, 2, 8))
 
     Attributes:
-        n_particles: N.
-        boundary: "periodic" or "fixed".
+        n_particles: N; None for 256, or what a lattice's shape holds.
+        boundary: "periodic" or "fixed"; of lattices also "free".
         disorder: of the masses.
         excitation: Impulse or StandingWave; every tone of a StandingWave is a run of its own.
         times: output times (time,), in travel times of sound over one particle.
-        n_bands: B, looked at only where bands are asked for, or tones are left to the bands' centers.
+        n_bands: B, looked at only where bands are asked for, or tones are left to the bands' centers; None for 32, and for
+            lattices as many of up to 8 shells as all hold a wave to start with.
         realizations: chains in the ensemble.
         seed: realization i of it is the same chain in every run.
         tolerance: accuracy wanted for the observables, relative to their scale; None for the ensemble's own error.
@@ -53,6 +87,11 @@ class Scene(Printed):
         opposite_pairs: draw realizations in pairs of opposite disorder (see :meth:`Disorder.masses`), each pair one
             independent sample. It pays where an observable changes mostly with the odd part of the disorder, as the
             squared width after a kick does, costs up to half more error where it does not, and never biases.
+        lattice: "chain", "square", "triangular", "cubic" or "fcc", see :func:`torchchain.lattice`; None for chains.
+        shape: particles along each primitive vector of the lattice.
+        motion: of lattices, "vector" or "scalar".
+        removed_bonds: probability that a bond of the lattice is missing.
+        position_disorder: standard deviation of the coordinates of the lattice's particles, in spacings.
 
     Raises:
         FieldError, FieldTypeError: one line with the field, the rule and the value.
@@ -63,12 +102,12 @@ class Scene(Printed):
         ((10, 128), (2,))
     """
 
-    n_particles: int = 256
+    n_particles: int = None  # type: ignore[assignment]
     boundary: str = "periodic"
     disorder: Disorder = field(default_factory=Disorder)
     excitation: Impulse | StandingWave = field(default_factory=StandingWave)
     times: Any = field(default_factory=lambda: regular_times(0.0, 50.0, 0.25))
-    n_bands: int = 32
+    n_bands: int = None  # type: ignore[assignment]
     realizations: int = 100
     seed: int = 0
     tolerance: float | None = None
@@ -79,13 +118,26 @@ class Scene(Printed):
     energy_definition: str = "site"
     si: Scaling | None = None
     opposite_pairs: bool = False
+    lattice: str | None = None
+    shape: tuple[int, ...] | None = None
+    motion: str = "vector"
+    removed_bonds: float = 0.0
+    position_disorder: float = 0.0
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
 
+        if self.lattice is None:
+            for name, default in OF_LATTICES.items():
+                if getattr(self, name) != default:
+                    raise checks.fail(name, "be left out without a lattice", checks.shown(getattr(self, name)))
+            put("n_particles", 256 if self.n_particles is None else self.n_particles)
+            put("n_bands", 32 if self.n_bands is None else self.n_bands)
+        else:
+            self._check_lattice(put)
         put("n_particles", checks.integer("n_particles", self.n_particles, 2, LARGEST_CHAIN))
-        checks.choice("boundary", self.boundary, BOUNDARIES)
+        checks.choice("boundary", self.boundary, BOUNDARIES if self.lattice is None else LATTICE_BOUNDARIES)
         put("realizations", checks.integer("realizations", self.realizations, 1, 10**9))
         put("seed", checks.integer("seed", self.seed, 0, 2**64 - 1))
         put("n_bands", checks.integer("n_bands", self.n_bands, 1))
@@ -110,21 +162,101 @@ class Scene(Printed):
         put("observables", tuple(checks.choice("observables", name, OBSERVABLES) for name in self.observables))
         if len(set(self.observables)) < len(self.observables):
             raise checks.fail("observables", "be different", self.observables)
-        self.excitation.check(self.n_particles)
-        if self.needs_bands:
+        self._check_excitation()
+        if self.needs_bands and self.lattices is not None:
+            self.lattices.bands(self.n_bands)
+        elif self.needs_bands:
             check_bands(self.n_particles, self.n_bands)
             if isinstance(self.excitation, StandingWave):  # the center tone of the last band can be N/2
                 dataclasses.replace(self.excitation, tones=self.tones).check(self.n_particles)
         for entry in chosen_observables(self.observables):
             of = f"for the observable {entry.name}"
+            if self.kind not in entry.kinds:
+                several = ", ".join(n for n, o in OBSERVABLES.items() if self.kind in o.kinds)
+                raise checks.fail("observables", f"be of {self.kind}s ({several})", repr(entry.name))
             if entry.wavenumbers and self.contact == "hertz":
                 raise checks.fail("contact", f"be 'linear' {of}", repr(self.contact))
-            if entry.wavenumbers and self.energy_definition == "bond" and self.boundary == "fixed":
+            if entry.wavenumbers and self.energy_definition == "bond" and self.boundary == "fixed" and not self.lattice:
                 raise checks.fail("boundary", f"be 'periodic' {of} by 'bond'", repr(self.boundary))
             if not entry.damped and self.damping > 0:
                 raise checks.fail("damping", f"be zero {of}", self.damping)
-        if self.contact == "hertz" and self.energy_definition == "site":
-            put("energy_definition", "bond")  # the only one that a Hertz contact has
+        if (self.contact == "hertz" or self.lattice) and self.energy_definition == "site":
+            put("energy_definition", "bond")  # the only one that a Hertz contact has; that of lattices in space
+
+    def _check_lattice(self, put: Callable[[str, Any], None]) -> None:
+        """Checks what lattices have of their own, and fills in what follows from it."""
+        if isinstance(self.shape, list):
+            put("shape", tuple(self.shape))
+        if self.shape is None:
+            raise checks.fail("shape", "be given for a lattice", None)
+        checks.choice("boundary", self.boundary, LATTICE_BOUNDARIES)
+        checks.number("damping", self.damping, at_least=0)
+        if self.contact == "auto":
+            put("contact", "linear")
+        if self.contact != "linear":
+            raise checks.fail("contact", "be 'linear' for a lattice", repr(self.contact))
+        if self.si is not None:
+            raise checks.fail("si", "be left out for a lattice", "beads")
+        if self.position_disorder and self.opposite_pairs:
+            raise checks.fail("opposite_pairs", "be False with position_disorder", self.opposite_pairs)
+        checks.instance("disorder", self.disorder, Disorder)
+        checks.instance("stiffness_disorder", self.stiffness_disorder, Disorder, type(None))
+        lattices = self.lattices
+        assert lattices is not None
+        n = lattices.n_particles
+        if self.n_particles not in (None, n):
+            raise checks.fail(
+                "n_particles", f"be left out for a lattice of shape {self.shape}, which has {n}", self.n_particles
+            )
+        put("n_particles", n)
+        for name in ("shape", "removed_bonds", "position_disorder"):
+            put(name, getattr(lattices, {"position_disorder": "moved"}.get(name, name)))
+        if self.n_bands is None:
+            put("n_bands", lattices.default_bands)
+
+    def _check_excitation(self) -> None:
+        if self.lattice is None or isinstance(self.excitation, Impulse):
+            self.excitation.check(self.n_particles)
+            return
+        for tone in self.excitation.tones or ():
+            checks.integer("excitation.tones", tone, 1, self.n_bands)
+
+    @cached_property
+    def lattices(self) -> RandomLattices | None:
+        """What the lattices of the scene are drawn from; None for chains."""
+        if self.lattice is None or self.shape is None:
+            return None
+        return RandomLattices(
+            self.lattice, self.shape, self.motion, self.boundary, self.disorder, self.stiffness_disorder,
+            self.removed_bonds, self.position_disorder, self.damping, self.opposite_pairs,
+        )  # fmt: skip
+
+    @property
+    def kind(self) -> str:
+        """Of system: "chain" or "lattice"."""
+        return "chain" if self.lattice is None else "lattice"
+
+    @property
+    def methods(self) -> dict[str, Method]:
+        """The ways to evolve the scene's systems, by name."""
+        return METHODS if self.lattice is None else NETWORK_METHODS
+
+    @property
+    def n_components(self) -> int:
+        """Displacements per particle."""
+        return 1 if self.lattices is None else self.lattices.n_components
+
+    @property
+    def site(self) -> int:
+        """The particle that an impulse strikes; 1 for other starts."""
+        return self.excitation.site if isinstance(self.excitation, Impulse) else 1
+
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Of the axes that results can have."""
+        n = self.n_particles
+        found = {"time": len(self.times), "particle": n, "wavenumber": n // 2 + 1, "band": self.n_bands}
+        return found if self.lattices is None else found | {"ring": len(self.lattices.ring_edges(self.site)) - 1}
 
     def _rows(self) -> dict[str, str]:
         def words(record: Any) -> str:
@@ -135,11 +267,16 @@ class Scene(Printed):
         if isinstance(self.excitation, StandingWave):
             wave = f"{_listed(self.tones, 'tone', 'tones')} of a standing wave: {words(self.excitation)}"
         contacts = f"{self.contact}, damping {self.damping:g}"
+        size = f"{self.boundary}, of {self.n_particles} particles"
+        if self.lattice is not None:
+            wave = wave.replace("tone", "band").replace("a standing wave", "plane waves")
+            contacts += f", {self.removed_bonds:g} of the bonds removed" if self.removed_bonds else ""
+            size = f"{_shape(self)} {self.lattice}, motion '{self.motion}', {self.boundary}"
         if self.stiffness_disorder is not None:
             contacts += f", stiffness disorder: {words(self.stiffness_disorder)}"
         pairs = " in opposite pairs" if self.sample_size == 2 else ""
         rows = {
-            "chains": f"{self.realizations}{pairs}, {self.boundary}, of {self.n_particles} particles, seed {self.seed}",
+            f"{self.kind}s": f"{self.realizations}{pairs}, {size}, seed {self.seed}",
             "disorder": words(self.disorder),
             "contacts": contacts,
             "excitation": wave,
@@ -158,7 +295,9 @@ class Scene(Printed):
 
     @property
     def is_ordered(self) -> bool:
-        """Whether every realization is the same chain."""
+        """Whether every realization is the same chain or lattice."""
+        if self.lattices is not None:
+            return self.lattices.is_ordered
         return self.disorder.strength == 0 and (
             self.stiffness_disorder is None or self.stiffness_disorder.strength == 0
         )
@@ -175,15 +314,23 @@ class Scene(Printed):
 
     @property
     def tones(self) -> tuple[int, ...]:
-        """The tones of the standing waves, counted from 1; empty for an impulse."""
+        """The tones of the standing waves, counted from 1; of lattices, bands; empty for an impulse."""
         if isinstance(self.excitation, Impulse):
             return ()
+        if self.lattice is not None:
+            return self.excitation.tones or tuple(range(1, self.n_bands + 1))
         return self.excitation.tones or center_tones(self.n_particles, self.n_bands)
 
     def chain(
         self, realizations: Iterable[int], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
     ) -> Chain:
-        """The chains of the given realizations (counted from 0), masses (realization, particle)."""
+        """The chains of the given realizations (counted from 0), masses (realization, particle).
+
+        Raises:
+            FieldError: for a scene of lattices, see :meth:`system`.
+        """
+        if self.lattice is not None:
+            raise checks.fail("lattice", "be None for chains (scene.system gives either)", repr(self.lattice))
         numbers = list(realizations)
         masses = self.disorder.masses(self.n_particles, numbers, self.seed, self.opposite_pairs)
         stiffness: float | Tensor = 1.0
@@ -194,8 +341,23 @@ class Scene(Printed):
             )
         return Chain(masses.to(device, dtype), self.boundary, stiffness, self.contact, self.damping)
 
-    def state(self, chain: Chain) -> State:
-        """The start of every chain, (realization, particle) or (realization, tone, particle)."""
+    def system(
+        self, realizations: Iterable[int], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
+    ) -> Chain | Lattice:
+        """The chains or lattices of the given realizations (counted from 0), masses (realization, particle)."""
+        if self.lattices is None:
+            return self.chain(realizations, device, dtype)
+        made = self.lattices.draw(list(realizations), self.seed)
+        return made if dtype == torch.float64 and torch.device(device).type == "cpu" else _moved(made, device, dtype)
+
+    def state(self, chain: Chain | Lattice) -> State:
+        """The start of every system, (realization, particle) or (realization, tone, particle), and component of lattices."""
+        if isinstance(chain, Lattice):
+            assert self.lattices is not None, "lattices are of a scene of lattices"
+            if isinstance(self.excitation, Impulse):
+                return self.lattices.kick(chain, self.excitation.site, self.excitation.velocity)
+            wave = self.excitation
+            return self.lattices.waves(chain, self.n_bands, self.tones, wave.amplitude, wave.phase)
         if isinstance(self.excitation, Impulse):
             return self.excitation.state(chain)
         return dataclasses.replace(self.excitation, tones=self.tones).state(chain)
@@ -205,6 +367,8 @@ class Scene(Printed):
         plain: dict[str, Any] = {}
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)
+            if entry.name in ("n_particles", "energy_definition") if self.lattice else entry.name in OF_LATTICES:
+                continue  # of a lattice they follow, a chain has them not
             if entry.name == "times":
                 value = _times_table(value)
             elif entry.name == "excitation":
@@ -242,8 +406,9 @@ class Scene(Printed):
             fields["excitation"] = _from_table("excitation", table, EXCITATIONS[kind])
         if isinstance(fields.get("times"), Mapping):
             fields["times"] = _times_from_table(fields["times"])
-        if isinstance(fields.get("observables"), list):
-            fields["observables"] = tuple(fields["observables"])
+        for name in ("observables", "shape"):
+            if isinstance(fields.get(name), list):
+                fields[name] = tuple(fields[name])
         return cls(**fields)
 
     @classmethod
@@ -361,6 +526,20 @@ def _listed(values: Sequence[float], one: str, many: str) -> str:
     return f"{len(values)} {many} from {values[0]:g} to {values[-1]:g}"
 
 
+def _shape(scene: Scene) -> str:
+    return " x ".join(map(str, scene.shape or ()))
+
+
+def _moved(network: Lattice, device: torch.device | str, dtype: torch.dtype) -> Lattice:
+    """The lattices on another device, in another precision."""
+    values: dict[str, Any] = {
+        entry.name: value.to(device, dtype if value.is_floating_point() else None)
+        for entry in dataclasses.fields(network)
+        if entry.init and isinstance(value := getattr(network, entry.name), Tensor)
+    }
+    return dataclasses.replace(network, **values)
+
+
 def describe(scene: Scene) -> str:
     """The scene in one line, for titles and logs."""
     wave = (
@@ -370,7 +549,8 @@ def describe(scene: Scene) -> str:
     )
     end = np.format_float_positional(float(scene.times[-1]), trim="-")
     pairs = " in opposite pairs" if scene.sample_size == 2 else ""
-    return (
-        f"{scene.realizations} {scene.boundary} chains{pairs}, N = {scene.n_particles}, xi = {scene.disorder.strength:g}, "
-        f"{wave}, {len(scene.times)} times to {end}"
-    )
+    what = f"{scene.boundary} chains{pairs}, N = {scene.n_particles}"
+    if scene.lattice is not None:
+        wave = wave.replace("standing", "plane")
+        what = f"{scene.boundary} {scene.lattice} lattices{pairs}, {_shape(scene)}, {scene.motion}"
+    return f"{scene.realizations} {what}, xi = {scene.disorder.strength:g}, {wave}, {len(scene.times)} times to {end}"

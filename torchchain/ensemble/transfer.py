@@ -42,6 +42,8 @@ from torchchain.threads import single_thread
 
 THEORY = "theory"
 """The method of a transfer without chains."""
+MOST_UNKNOWNS = 1500
+"""Of lattices whose long-time average is taken from all modes; beyond it from the later half of the times."""
 OF_RUNS = ("mass_mean", "mass_sd", "start_condition")
 """Attributes of a transfer from runs of another code."""
 
@@ -562,11 +564,14 @@ def band_transfer(
 ) -> BandTransfer:
     """The transfer of energy from every band to every band: one standing wave per band, averaged over the ensemble.
 
+    Of lattices, one plane wave per shell of |q| and polarization.
+
     Args:
         scene: standing waves with one tone in each of its bands, or none given (the bands' center tones).
         method: a name of ``evolvers.METHODS``; "auto" for the plan's choice; or "theory" for band energies without chains
             (see :func:`torchchain.theory.theory_transfer`): no statistical error, ``systematic`` as its own estimate.
-        long_time: also take the exact infinite-time average from the modes; damped chains have none.
+        long_time: also take the exact infinite-time average from the modes; damped chains have none. Of lattices with more
+            than 1500 unknowns it is the mean over the later half of the times, whose error counts what has not settled.
         device, memory_budget, progress, stages, options: see :func:`stream`.
         checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
         ranks: processes that share the realizations, from :func:`torchchain.ranks.process_group`; each gets the result.
@@ -589,18 +594,40 @@ def band_transfer(
         checks.known_keys("options of method 'theory'", options or {}, ())
         with stages("theory"):
             return _from_theory(scene, long_time and scene.damping == 0)
-    late = ("long_time_band_energy",) if long_time and scene.damping == 0 else ()
+    long_time = long_time and scene.damping == 0
+    exact = scene.lattice is None or scene.n_particles * scene.n_components <= MOST_UNKNOWNS
+    late = ("long_time_band_energy",) if long_time and exact else ()
     ensemble = ensemble_moments(
         replace(scene, observables=("band_energy", *late)), method,
         min(BLOCKS, scene.distinct_realizations // scene.sample_size), device=device, memory_budget=memory_budget,
         progress=progress, stages=stages, options=options, checkpoint=checkpoint, ranks=ranks,
     )  # fmt: skip
     with single_thread(), stages("statistics"):
-        return _from_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None)
+        found = _from_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None)
+        return found if exact or not long_time else _with_late_average(found)
+
+
+def _with_late_average(transfer: BandTransfer) -> BandTransfer:
+    """The long-time average over the later half of the times, its error that of the block means and of not having settled."""
+    average, unsettled = _late_average(transfer.times, transfer.mean[None])
+    blocks, _ = _late_average(transfer.times, transfer.block_mean)
+    weights = torch.tensor(transfer.block_counts, dtype=blocks.dtype)[:, None, None]
+    squares = (weights * (blocks - average).square()).sum(0)
+    error = (
+        (squares / weights.sum() / max(len(blocks) - 1, 1)).sqrt()
+        if len(blocks) > 1
+        else torch.full_like(squares, torch.inf)
+    )
+    if transfer.is_ordered:
+        error = torch.zeros_like(squares)
+    stderr = (error.square() + unsettled.square()).sqrt()
+    return replace(transfer, long_time=average[0], long_time_stderr=stderr, block_long_time=blocks)
 
 
 def _from_theory(scene: Scene, long_time: bool) -> BandTransfer:
     """The transfer of the scene's law of disorder, without chains; its realizations do not matter."""
+    if scene.lattice is not None:
+        raise checks.fail("method", "not be 'theory' for lattices", repr(THEORY))
     if scene.energy_definition != "site":
         raise checks.fail("energy_definition", "be 'site' for method 'theory'", repr(scene.energy_definition))
     found = theory_transfer(
@@ -651,7 +678,7 @@ def _transfer_scene(scene: Scene) -> Scene:
     if not isinstance(scene.excitation, StandingWave):
         raise checks.fail("excitation", "be standing waves for a band transfer", type(scene.excitation).__name__)
     scene = replace(scene, observables=("band_energy",), excitation=replace(scene.excitation, tones=scene.tones))
-    bands = [band_of(tone, scene.n_particles, scene.n_bands) for tone in scene.tones]
+    bands = [tone if scene.lattice else band_of(tone, scene.n_particles, scene.n_bands) for tone in scene.tones]
     if bands != list(range(1, scene.n_bands + 1)):
         raise checks.fail(
             "excitation.tones", f"lie one in each of the {scene.n_bands} bands, in order", f"bands {bands}"

@@ -304,7 +304,7 @@ def band_turns(kind: str, shape: tuple[int, ...], n_shells: int) -> Tensor:
     def found(n: int) -> list[int]:
         edges = torch.linspace(0, 1, n + 1, dtype=torch.float64) * ZONE_RADIUS[kind]
         shell = torch.bucketize(where.lengths * (1 - 1e-12), edges) - 1
-        waves = []
+        waves: list[int] = []
         for s in range(n):
             held = (usable & (shell == s)).nonzero()[:, 0]
             if len(held) == 0:

@@ -461,6 +461,8 @@ METHOD = Method(
     stability="unconditional: the spectrum lies below a rigorous bound; networks that are not stable are refused",
     cost="about W t / 2 products with the bonds and some sums per output (W: the bound); memory of a few states",
     cannot="damping, contacts that open",
+    candidate=True,
+    compiled=True,
     options={
         "accuracy": "what truncation may leave out, relative to the size of the state, over 1024 segments (1e-12)",
         "bound": "squared frequency that no mode exceeds, a number or (*batch,); by default a rigorous one",

@@ -77,4 +77,6 @@ METHOD = Method(
     cost="about 20 (2 n c)^3 for each different interval, (2 n c)^2 per output time; (2 n c)^2 memory",
     cannot="contacts that open, more than some thousand unknowns",
     damped=True,
+    candidate=True,
+    matrices=24,
 )

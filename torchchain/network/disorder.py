@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torchchain import checks
 from torchchain.chain import Disorder
 from torchchain.network.networks import Network
 
+AnyNetwork = TypeVar("AnyNetwork", bound=Network)
 _BONDS, _POSITIONS, _KINDS = 2, 3, 4  # random streams of a realization, besides those of masses and stiffnesses
 
 
@@ -82,9 +83,7 @@ def diluted(network: Network, fraction: float, realizations: int | Iterable[int]
     _one(network)
     fraction = checks.number("fraction", fraction, at_least=0, at_most=1)
     numbers = _numbers(realizations)
-    seed = checks.integer("seed", seed, 0, 2**64 - 1)
-    kept = np.stack([uniform(network.n_bonds, i, seed, _BONDS) >= fraction for i in numbers])
-    keep = torch.from_numpy(kept).to(network.masses)
+    keep = kept_bonds(network.n_bonds, fraction, numbers, seed).to(network.masses)
     changes: dict[str, Any] = {
         "masses": network.masses.expand(len(numbers), -1),
         "stiffness": network.bond_stiffness * keep,
@@ -96,7 +95,14 @@ def diluted(network: Network, fraction: float, realizations: int | Iterable[int]
     return replace(network, **changes)
 
 
-def displaced(network: Network, strength: float, realization: int = 0, seed: int = 0) -> Network:
+def kept_bonds(n_bonds: int, fraction: float, realizations: Iterable[int], seed: int) -> Tensor:
+    """1 for a bond that stays, 0 for one removed with this probability, (realization, bond)."""
+    seed = checks.integer("seed", seed, 0, 2**64 - 1)
+    kept = [uniform(n_bonds, i, seed, _BONDS) >= fraction for i in realizations]
+    return torch.from_numpy(np.stack(kept)).double()
+
+
+def displaced(network: AnyNetwork, strength: float, realization: int = 0, seed: int = 0) -> AnyNetwork:
     """The network with its particles moved by independent normal steps, its bonds at rest at their new lengths.
 
     Args:

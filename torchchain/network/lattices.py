@@ -35,6 +35,7 @@ STEPS: dict[str, tuple[tuple[int, ...], ...]] = {
 """Half of the nearest neighbors, in primitive vectors."""
 
 BOUNDARIES = ("periodic", "fixed", "free")
+MOST_PARTICLES = 10**8
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +98,32 @@ def _equal(values: float | Tensor) -> bool:
     return values.numel() < 2 or bool((values == values.flatten()[0]).all())
 
 
+def extent_of(
+    kind: str, shape: Sequence[int], boundary: str | Sequence[str]
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Shape and boundary along each axis, checked; see :func:`lattice`."""
+    checks.choice("kind", kind, PRIMITIVE)
+    d = len(PRIMITIVE[kind])
+    if isinstance(shape, int) or not checks.is_collection(shape):
+        raise checks.FieldTypeError(f"shape must be {d} integers for kind '{kind}', got {checks.shown(shape)}")
+    extent = tuple(checks.integer("shape", a, 1) for a in shape)
+    if len(extent) != d:
+        raise checks.fail("shape", f"have {d} entries for kind '{kind}'", extent)
+    if not isinstance(boundary, str) and not checks.is_collection(boundary):
+        raise checks.FieldTypeError(f"boundary must be a string or one for each axis, got {checks.shown(boundary)}")
+    walls = (boundary,) * d if isinstance(boundary, str) else tuple(boundary)
+    for wall in walls:
+        checks.choice("boundary", wall, BOUNDARIES)
+    if len(walls) != d:
+        raise checks.fail("boundary", f"be one or {d} for kind '{kind}'", walls)
+    for a, wall in zip(extent, walls, strict=True):
+        if wall == "periodic" and a < 3:
+            raise checks.fail("shape", "be at least 3 along a periodic axis, where bonds would meet twice", extent)
+    if math.prod(extent) > MOST_PARTICLES:
+        raise checks.fail("shape", f"hold at most {MOST_PARTICLES} particles", extent)
+    return extent, walls
+
+
 def lattice(
     kind: str, shape: Sequence[int], motion: str = "vector", boundary: str | Sequence[str] = "periodic"
 ) -> Lattice:
@@ -120,24 +147,8 @@ def lattice(
     Raises:
         FieldError: for an unknown kind, a shape of another dimension, or fewer than 3 particles along a periodic axis.
     """
-    checks.choice("kind", kind, PRIMITIVE)
-    primitive = np.array(PRIMITIVE[kind])
-    d = len(primitive)
-    if isinstance(shape, int) or not checks.is_collection(shape):
-        raise checks.FieldTypeError(f"shape must be {d} integers for kind '{kind}', got {checks.shown(shape)}")
-    extent = tuple(checks.integer("shape", a, 1) for a in shape)
-    if len(extent) != d:
-        raise checks.fail("shape", f"have {d} entries for kind '{kind}'", extent)
-    if not isinstance(boundary, str) and not checks.is_collection(boundary):
-        raise checks.FieldTypeError(f"boundary must be a string or one for each axis, got {checks.shown(boundary)}")
-    walls = (boundary,) * d if isinstance(boundary, str) else tuple(boundary)
-    for wall in walls:
-        checks.choice("boundary", wall, BOUNDARIES)
-    if len(walls) != d:
-        raise checks.fail("boundary", f"be one or {d} for kind '{kind}'", walls)
-    for a, wall in zip(extent, walls, strict=True):
-        if wall == "periodic" and a < 3:
-            raise checks.fail("shape", "be at least 3 along a periodic axis, where bonds would meet twice", extent)
+    extent, walls = extent_of(kind, shape, boundary)
+    primitive, d = np.array(PRIMITIVE[kind]), len(extent)
     n = math.prod(extent)
     sites = np.stack(np.unravel_index(np.arange(n), extent), axis=1)
     strides = np.array([math.prod(extent[a + 1 :]) for a in range(d)])

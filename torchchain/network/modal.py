@@ -64,5 +64,7 @@ METHOD = Method(
     stability="unconditional; networks that are not stable are refused",
     cost="(n c)^3 once for n particles of c components, (n c)^2 per output time; (n c)^2 memory",
     cannot="damping, contacts that open, more than some thousand unknowns",
+    candidate=True,
+    matrices=12,
     options={"modes": "NetworkModes of the network, where they are at hand"},
 )

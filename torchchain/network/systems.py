@@ -1,15 +1,23 @@
-"""One name for chains and networks: ``tc.evolve`` and ``tc.normal_modes`` take either."""
+"""One name for chains and networks: ``tc.evolve``, ``tc.normal_modes`` and the energies take either."""
 
 from __future__ import annotations
 
 from typing import Any, overload
 
+from torch import Tensor
+
+from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
+from torchchain.energy import space, wavenumber
 from torchchain.evolvers import evolved
 from torchchain.modes import spectrum
 from torchchain.modes.spectrum import NormalModes
+from torchchain.network import bands
+from torchchain.network import energy as network_space
 from torchchain.network import evolvers as networks
+from torchchain.network import wavenumber as network_wavenumber
+from torchchain.network.lattices import Lattice
 from torchchain.network.modes import NetworkModes
 from torchchain.network.modes import normal_modes as network_modes
 from torchchain.network.networks import Network
@@ -72,3 +80,123 @@ def normal_modes(chain: Chain | Network) -> NormalModes | NetworkModes:
     tensor([0.0000, 1.4142, 1.4142, 2.0000], dtype=torch.float64)
     """
     return network_modes(chain) if isinstance(chain, Network) else spectrum.normal_modes(chain)
+
+
+def particle_energy(chain: Chain | Network, trajectory: Trajectory, definition: str | None = None) -> Tensor:
+    """Total energy of every particle of a chain (Eq. 36) or a network, (*batch, time, particle).
+
+    Args:
+        chain: a chain or a network.
+        trajectory: its states in time.
+        definition: "site", -F u / 2 besides the kinetic energy (Eq. 36), or "bond", half of the energy of each of a
+            particle's contacts (Eq. A3). None: "site" for a chain, "bond" for a network.
+
+    Raises:
+        FieldError: for states of another system, or "site" for Hertz contacts.
+
+    >>> import torch, torchchain as tc
+    >>> network = tc.lattice("triangular", (4, 4))
+    >>> kick = torch.zeros(16, 2, dtype=torch.float64)
+    >>> kick[0, 0] = 1.0
+    >>> path = tc.evolve(network, tc.State(torch.zeros_like(kick), kick), [0.0, 1.0])
+    >>> tc.particle_energy(network, path).sum(-1)
+    tensor([0.5000, 0.5000], dtype=torch.float64)
+    """
+    if isinstance(chain, Network):
+        return network_space.particle_energy(chain, trajectory, "bond" if definition is None else definition)
+    return space.particle_energy(chain, trajectory, "site" if definition is None else definition)
+
+
+def kinetic_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
+    """Kinetic energy of every particle of a chain (Eq. 30) or a network, (*batch, time, particle)."""
+    return (network_space if isinstance(chain, Network) else space).kinetic_energy(chain, trajectory)
+
+
+def total_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
+    """Energy of a whole chain (Eq. 41) or network relative to its state of rest, (*batch, time)."""
+    return (network_space if isinstance(chain, Network) else space).total_energy(chain, trajectory)
+
+
+def bond_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
+    """Energy stored in every contact of a chain or bond of a network, (*batch, time, contact | bond)."""
+    if isinstance(chain, Network):
+        return network_space.bond_energy(chain, trajectory)
+    space.checked(chain, trajectory)
+    return checks.finite("energy of trajectory", chain.contact_energy(trajectory.displacement), "contact")
+
+
+def wavenumber_energy(chain: Chain | Network, trajectory: Trajectory, definition: str = "site") -> Tensor:
+    """Energy at every wavenumber of a chain (Eq. 43), or at every wavevector and polarization of a lattice.
+
+    Returns:
+        (*batch, time, wavenumber) of a chain, see :func:`torchchain.energy.wavenumber_energy`; (*batch, time, wavevector,
+        polarization) of a lattice, see :func:`torchchain.network.wavenumber_energy`.
+    """
+    if isinstance(chain, Network):
+        _only_site(definition)
+        return network_wavenumber.wavenumber_energy(_lattice(chain), trajectory)
+    return wavenumber.wavenumber_energy(chain, trajectory, definition)
+
+
+def band_energy(
+    chain: Chain | Network,
+    trajectory: Trajectory,
+    n_bands: int = 32,
+    normalize: bool = True,
+    definition: str = "site",
+) -> Tensor:
+    """Energy in each band: of |k| on a chain (Eqs. 44-46), of |q| and polarization on a periodic lattice.
+
+    Args:
+        chain: a chain of linear contacts with an even number of particles, or a periodic lattice; packings have
+            :func:`torchchain.network.plane_wave_energy`.
+        trajectory: its states in time.
+        n_bands: B; on a lattice shells times polarizations, longitudinal ones first.
+        normalize: divide by the total energy.
+        definition: of a chain, see :func:`torchchain.energy.wavenumber_energy`; "site" on a lattice.
+
+    Returns:
+        (*batch, time, band).
+
+    Raises:
+        FieldError: if the bands do not divide the wavenumbers, or a state to be normalized has no energy.
+    """
+    if isinstance(chain, Network):
+        _only_site(definition)
+        return bands.band_energy(_lattice(chain), trajectory, n_bands, normalize)
+    return wavenumber.band_energy(chain, trajectory, n_bands, normalize, definition)
+
+
+def long_time_band_energy(
+    chain: Chain | Network,
+    state: State,
+    n_bands: int = 32,
+    normalize: bool = True,
+    modes: Any = None,
+    definition: str = "site",
+) -> Tensor:
+    """Infinite-time average of :func:`band_energy`, (*batch, *any, band), exactly, from the modes: no time stepping.
+
+    Args:
+        chain: an undamped chain of linear contacts, or a periodic lattice.
+        state: its start, (*batch, *any, particle), and (component) for a lattice.
+        n_bands, normalize, definition: as for :func:`band_energy`.
+        modes: the system's :func:`normal_modes`, where they are at hand.
+    """
+    if isinstance(chain, Network):
+        _only_site(definition)
+        return bands.long_time_band_energy(_lattice(chain), state, n_bands, normalize, modes)
+    return wavenumber.long_time_band_energy(chain, state, n_bands, normalize, modes, definition)
+
+
+def _lattice(network: Network) -> Lattice:
+    if not isinstance(network, Lattice):
+        raise checks.FieldTypeError(
+            "network must be a lattice for its wavevectors (use torchchain.network.plane_wave_energy for a packing), "
+            f"got a {type(network).__name__}"
+        )
+    return network
+
+
+def _only_site(definition: str) -> None:
+    checks.choice("definition of a lattice's wavenumber energy", definition, ("site",))

@@ -209,6 +209,10 @@ METHOD = Method(
     cannot="keep phases: their error grows with time; gradients and accelerators, for grains",
     contacts=("linear", "hertz"),
     damped=True,
+    candidate=True,
+    order_in_step=2,
+    phase_error=1 / 24,
+    stability_limit=2.0,
     options={
         "step": "largest step; outputs are reached by equal steps of at most that (default 0.1 / W)",
         "linear": "True for the linear motion of a packing's network",

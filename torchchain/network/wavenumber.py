@@ -57,8 +57,8 @@ def zone(network: Lattice) -> Zone:
     if not network.is_periodic:
         raise checks.fail("boundary", "be periodic for wavevectors of a lattice", network.boundary)
     found, device = zone_of(network.kind, network.shape), network.bonds.device
-    values = (x.to(network.positions) for x in (found.wavevectors, found.lengths, found.longitudinal))
-    return Zone(found.turns.to(device), *values, found.is_edge.to(device))
+    q, lengths, longitudinal = (x.to(network.positions) for x in (found.wavevectors, found.lengths, found.longitudinal))
+    return Zone(found.turns.to(device), q, lengths, longitudinal, found.is_edge.to(device))
 
 
 @lru_cache(maxsize=32)
