@@ -21,7 +21,7 @@ from torchchain.chain.disorder import Disorder
 from torchchain.chain.excitation import Impulse, StandingWave
 from torchchain.chain.scaling import Scaling
 from torchchain.chain.states import State
-from torchchain.energy.bands import center_tones, check_bands
+from torchchain.energy.bands import band_of, center_tones, check_bands
 from torchchain.ensemble.observables import OBSERVABLES, chosen_observables
 from torchchain.ensemble.printed import Printed
 from torchchain.evolvers import METHODS, Method
@@ -320,6 +320,13 @@ class Scene(Printed):
         if self.lattice is not None:
             return self.excitation.tones or tuple(range(1, self.n_bands + 1))
         return self.excitation.tones or center_tones(self.n_particles, self.n_bands)
+
+    @property
+    def source_bands(self) -> list[int]:
+        """The band, counted from 1, that holds each of the tones."""
+        if self.lattice is not None:
+            return list(self.tones)
+        return [band_of(tone, self.n_particles, self.n_bands) for tone in self.tones]
 
     def chain(
         self, realizations: Iterable[int], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64

@@ -21,7 +21,6 @@ from torchchain._version import __version__
 from torchchain.chain.chain import Chain
 from torchchain.chain.excitation import StandingWave
 from torchchain.chain.states import Trajectory
-from torchchain.energy.bands import band_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.block_means import decoded, encoded, rounded
 from torchchain.ensemble.checkpoint import Checkpoint
@@ -678,7 +677,7 @@ def _transfer_scene(scene: Scene) -> Scene:
     if not isinstance(scene.excitation, StandingWave):
         raise checks.fail("excitation", "be standing waves for a band transfer", type(scene.excitation).__name__)
     scene = replace(scene, observables=("band_energy",), excitation=replace(scene.excitation, tones=scene.tones))
-    bands = [tone if scene.lattice else band_of(tone, scene.n_particles, scene.n_bands) for tone in scene.tones]
+    bands = scene.source_bands
     if bands != list(range(1, scene.n_bands + 1)):
         raise checks.fail(
             "excitation.tones", f"lie one in each of the {scene.n_bands} bands, in order", f"bands {bands}"

@@ -736,7 +736,7 @@ def check_scene(scene: Scene | None) -> None:
     """Raise for chains that the model is not made for: the waves of its first odds are those of undamped, linear rings."""
     if scene is None:
         raise checks.fail("transfer", "be of chains of a scene for model 'compact'", "energies without one")
-    wanted: dict[str, Any] = {"boundary": "periodic", "damping": 0.0}
+    wanted: dict[str, Any] = {"lattice": None, "boundary": "periodic", "damping": 0.0}
     for name, value in wanted.items():
         if getattr(scene, name) != value:
             raise checks.fail(name, f"be {value} for model 'compact'", getattr(scene, name))

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.energy.bands import band_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.plan import ARTIFACT, Choice, Plan, statistical_error
 from torchchain.ensemble.scene import Scene
@@ -30,8 +29,7 @@ def missing(master: MasterEquation, scene: Scene) -> list[str]:
 
 def starts(master: MasterEquation, scene: Scene) -> Tensor:
     """A unit energy in the band of each tone, (tone, band)."""
-    bands = [band_of(tone, scene.n_particles, scene.n_bands) - 1 for tone in scene.tones]
-    return torch.eye(master.n_bands, dtype=torch.float64)[bands]
+    return torch.eye(master.n_bands, dtype=torch.float64)[[band - 1 for band in scene.source_bands]]
 
 
 def error(master: MasterEquation, scene: Scene) -> float | None:
