@@ -54,7 +54,7 @@ def test_simulate(run, tmp_path):
     status, output, errors = run("simulate", *SMALL, "--observables", *names, "--out", "here/there")
     out = tmp_path / "here" / "there"
     assert (status, errors) == (0, "")
-    assert sorted(os.listdir(out)) == ["config.toml", "figure.png", "results.nc", "run.json"]
+    assert sorted(os.listdir(out)) == ["config.toml", "figure.png", "report.html", "results.nc", "run.json"]
     assert os.listdir(tmp_path) == ["here"]
     assert os.listdir(tmp_path / "here") == ["there"]
     scene = tc.Scene.from_toml(out / "config.toml")
@@ -95,7 +95,7 @@ def test_corners_of_simulate(run, arguments):
 
 def test_calibrate(calibrated):
     assert sorted(os.listdir(calibrated)) == [
-        "config.toml", "figure.png", "model.safetensors", "run.json", "transfer.nc",
+        "config.toml", "figure.png", "model.safetensors", "report.html", "run.json", "transfer.nc",
     ]  # fmt: skip
     master = tc.MasterEquation.load(calibrated / "model.safetensors")
     with xarray.open_dataset(calibrated / "transfer.nc", engine="h5netcdf") as data:
@@ -611,4 +611,4 @@ def test_as_a_module(tmp_path):
     assert os.listdir(tmp_path) == []
     good = program("simulate", *SMALL, "--out", "out")
     assert (good.returncode, good.stderr) == (0, "")
-    assert sorted(os.listdir(tmp_path / "out")) == ["config.toml", "figure.png", "results.nc", "run.json"]
+    assert sorted(os.listdir(tmp_path / "out")) == ["config.toml", "figure.png", "report.html", "results.nc", "run.json"]

@@ -255,12 +255,12 @@ def test_import_calibrate_predict(run, tmp_path):
     status, output, errors = run("import", RUNS, *GOOD, "--out", "data")
     assert (status, errors) == (0, "")
     assert "starts: one band each" in output
-    assert sorted(os.listdir("data")) == ["config.toml", "figure.png", "run.json", "transfer.nc"]
+    assert sorted(os.listdir("data")) == ["config.toml", "figure.png", "report.html", "run.json", "transfer.nc"]
     assert os.listdir(tmp_path) == ["data"]
     opened = tc.open("data")
     assert opened.scene is None
     record = opened.record
-    assert set(record["files"]) == {"config.toml", "transfer.nc", "figure.png"}
+    assert set(record["files"]) == {"config.toml", "transfer.nc", "figure.png", "report.html"}
     assert len(record["inputs"]) == 8  # six runs and two references
     for name, value in record["inputs"].items():
         assert outputs.sha256(name) == value

@@ -142,7 +142,7 @@ def test_results_are_written_though_nobody_reads():
     process.stdout.close()
     assert process.stderr.read() == ""
     process.wait()
-    assert sorted(os.listdir("out")) == ["config.toml", "figure.png", "results.nc", "run.json"]
+    assert sorted(os.listdir("out")) == ["config.toml", "figure.png", "report.html", "results.nc", "run.json"]
 
 
 def test_warnings_as_errors_cost_no_result():

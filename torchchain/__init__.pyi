@@ -95,6 +95,7 @@ from torchchain.network.systems import normal_modes as normal_modes
 from torchchain.network.systems import particle_energy as particle_energy
 from torchchain.network.systems import total_energy as total_energy
 from torchchain.network.systems import wavenumber_energy as wavenumber_energy
+from torchchain.plots import plot_observable as plot_observable
 from torchchain.results import RunFolder as RunFolder
 from torchchain.results import open_folder as open
 

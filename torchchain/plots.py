@@ -1,17 +1,54 @@
-"""Figures: axes in, axes out, no computation."""
+"""Figures: axes in, axes out, no computation. Widths and letters are those of a journal's page."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchchain import checks
+
 if TYPE_CHECKING:
+    import xarray
     from matplotlib.axes import Axes
 
-TIME_LABEL = "time t"
-BAND_LABEL = "wavenumber band r"
+TIME_LABEL = "time $t$"
+BAND_LABEL = "wavenumber band $r$"
+COLUMN, PAGE = 3.5, 7.1
+"""Widths of a journal's column and of its page, in inches."""
+COLORS = ("#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00", "#cc79a7")
+"""Told apart by the color-blind; in gray by the dashes that go with them."""
+DASHES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)))
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Sizes for print while a figure is drawn: eight points, thin frames, colors and dashes that gray does not confuse."""
+    import matplotlib
+    from cycler import cycler
+
+    looks: Any = {
+        "font.size": 8, "axes.titlesize": 8, "axes.labelsize": 8, "figure.titlesize": 8, "legend.fontsize": 7,
+        "xtick.labelsize": 7, "ytick.labelsize": 7, "lines.linewidth": 1.2, "lines.markersize": 3.5, "axes.linewidth": 0.6,
+        "legend.frameon": False, "legend.handlelength": 2.2, "legend.columnspacing": 1.0, "legend.labelspacing": 0.2, "errorbar.capsize": 1.5, "axes.titlelocation": "left",
+        "axes.prop_cycle": cycler(color=COLORS) + cycler(linestyle=DASHES),
+    }  # fmt: skip
+    with matplotlib.rc_context(looks):
+        yield
+
+
+def lettered(axes: Iterable[Axes]) -> None:
+    """(a), (b), ... before the titles of the panels, each once."""
+    for letter, ax in zip("abcdefghijklmnopqrstuvwxyz", (ax for ax in axes if ax.axison), strict=False):
+        ax.set_title(f"({letter}) {ax.get_title('left')}".rstrip(), loc="left")
+
+
+def legend(ax: Axes, columns: int = 2, **where: Any) -> None:
+    """A legend below the axes, off the data."""
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.3, ncols=columns, **where)
 
 
 def band_map(ax: Axes, times: np.ndarray, energy: np.ndarray, title: str = "", floor: float = 1e-3) -> Axes:
@@ -22,7 +59,7 @@ def band_map(ax: Axes, times: np.ndarray, energy: np.ndarray, title: str = "", f
     image = ax.pcolormesh(
         times, bands, np.maximum(energy.T, floor), norm=LogNorm(floor, 1.0), shading="nearest", rasterized=True
     )
-    ax.figure.colorbar(image, ax=ax, label="share of energy")
+    ax.figure.colorbar(image, ax=ax, label="share of energy", extend="min")
     ax.set(xlabel=TIME_LABEL, ylabel=BAND_LABEL, title=title)
     return ax
 
@@ -59,6 +96,20 @@ def log_map(
     return ax
 
 
+def share_matrix(ax: Axes, shares: np.ndarray, title: str = "", floor: float = 1e-3) -> Axes:
+    """Shares of the energy [source, receiver] at one time, logarithmic colors; less is drawn as the floor."""
+    from matplotlib.colors import LogNorm
+
+    bands = np.arange(1, len(shares) + 1)
+    image = ax.pcolormesh(
+        bands, bands, np.maximum(shares, floor), norm=LogNorm(floor, 1.0), shading="nearest", rasterized=True
+    )
+    ax.figure.colorbar(image, ax=ax, label="share of energy", extend="min")
+    ax.set(xlabel="receiver $r$", ylabel="source $s$", title=title, aspect="equal")
+    ax.invert_yaxis()
+    return ax
+
+
 def rate_map(ax: Axes, rates: np.ndarray, title: str = "", top: float | None = None) -> Axes:
     """Rates between bands (as Fig. 17), rates [source, receiver]; the diagonal shows the loss rate -Q_ss."""
     shown = np.where(np.eye(len(rates), dtype=bool), -rates, rates)
@@ -68,10 +119,15 @@ def rate_map(ax: Axes, rates: np.ndarray, title: str = "", top: float | None = N
     from matplotlib.colors import LogNorm
 
     image = ax.pcolormesh(
-        bands, bands, np.clip(shown, top * 1e-4, None), norm=LogNorm(top * 1e-4, top), shading="nearest"
+        bands,
+        bands,
+        np.clip(shown, top * 1e-4, None),
+        norm=LogNorm(top * 1e-4, top),
+        shading="nearest",
+        rasterized=True,
     )
-    ax.figure.colorbar(image, ax=ax, label="rate")
-    ax.set(xlabel="receiver r", ylabel="source s", title=title, aspect="equal")
+    ax.figure.colorbar(image, ax=ax, label="rate", extend="min")
+    ax.set(xlabel="receiver $r$", ylabel="source $s$", title=title, aspect="equal")
     ax.invert_yaxis()
     return ax
 
@@ -80,36 +136,93 @@ def curve(ax: Axes, x: np.ndarray, mean: np.ndarray, stderr: np.ndarray | None =
     """A mean with a band of one standard error."""
     (line,) = ax.plot(x, mean, **style)
     if stderr is not None and np.isfinite(stderr).all():
-        ax.fill_between(x, mean - stderr, mean + stderr, color=line.get_color(), alpha=0.25, linewidth=0)
+        ax.fill_between(x, mean - stderr, mean + stderr, color=line.get_color(), alpha=0.3, linewidth=0)
     return ax
 
 
-def decay_comparison(
-    ax: Axes, times: np.ndarray, measured: np.ndarray, stderr: np.ndarray, predicted: np.ndarray,
-    pairs: list[tuple[int, int]], title: str = "",
-) -> Axes:  # fmt: skip
-    """Energy of some receivers over time (as Fig. 14): ensemble with error band, model dashed.
+def plot_observable(data: xarray.Dataset, name: str, log: bool = False, ax: Axes | None = None) -> Axes:
+    """An observable of :func:`torchchain.simulate` over time, such as "center" (R, Eq. 37) or "width" (r^2, Eq. 38).
 
-    Arrays are [source, time, receiver]; pairs of source and receiver are counted from 1.
+    Args:
+        data: holds ``name`` and its standard error ``{name}_stderr`` on the axis time, drawn as a band of one error.
+        name: of the observable.
+        log: both axes logarithmic, without time 0, as in Figs. 6 and 7.
+        ax: where to draw; None for a figure of its own, a column wide.
+
+    Returns:
+        The axes; ``ax.figure.savefig(...)`` writes them.
+
+    Raises:
+        FieldError: for a name that the data do not hold, or an observable with other axes than time.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=32, boundary="fixed", excitation=tc.Impulse(), observables=("width",), realizations=4)
+        >>> ax = tc.plot_observable(tc.simulate(scene, method="modes"), "width", log=True)
+        >>> ax.get_xscale(), ax.get_yscale(), ax.get_ylabel()
+        ('log', 'log', 'mean squared width $r^2$ (particle$^2$)')
     """
-    for source, receiver in pairs:
-        index = (source - 1, slice(None), receiver - 1)
-        curve(ax, times, measured[index], stderr[index], label=f"{source} to {receiver}")
-        ax.plot(times, predicted[index], "--", color=ax.lines[-1].get_color())
-    ax.plot([], [], "k-", label="ensemble")
-    ax.plot([], [], "k--", label="model")
-    ax.set(xlabel=TIME_LABEL, ylabel="share of energy", title=title, yscale="log", ylim=(1e-4, 1.5))
-    ax.legend(fontsize="small")
+    if name not in data.data_vars or f"{name}_stderr" not in data.data_vars:
+        held = [str(each).removesuffix("_stderr") for each in data.data_vars if str(each).endswith("_stderr")]
+        raise checks.fail("name", f"be one of {', '.join(held)}", repr(name))
+    values = data[name]
+    if values.dims != ("time",):
+        raise checks.fail(
+            "name", "be of an observable with the axis time alone", f"{name} with {', '.join(map(str, values.dims))}"
+        )
+    ax = own_axes() if ax is None else ax
+    kept = data["time"].values > 0 if log else slice(None)
+    curve(ax, data["time"].values[kept], values.values[kept], data[f"{name}_stderr"].values[kept])
+    ax.set(xlabel=TIME_LABEL, ylabel=label_of(values), **({"xscale": "log", "yscale": "log"} if log else {}))
+    return ax
+
+
+def label_of(values: xarray.DataArray) -> str:
+    """Name, symbol and unit of a variable or axis, symbols as such: "mean squared width r^2", "particle^2"."""
+    name, units = str(values.attrs.get("long_name", values.name)), str(values.attrs.get("units", ""))
+    name = re.sub(r"(?<= )(\|?[a-zA-Z]\|?(?:\^\d)?)$", r"$\1$", name)
+    units = re.sub(r"\^(\d)", r"$^\1$", units)
+    return f"{name} ({units})" if units else name
+
+
+def own_axes(width: float = COLUMN, height: float = 2.7) -> Axes:
+    """The axes of a figure of their own, a column wide."""
+    with style():
+        axes = figure(width, height, 1, 1)[1]
+        return axes[0, 0]
+
+
+def decays(
+    ax: Axes, times: np.ndarray, mean: np.ndarray, stderr: np.ndarray | None, source: int, receivers: Sequence[int],
+    predicted: np.ndarray | None = None, log: bool = True,
+) -> Axes:  # fmt: skip
+    """Share of the energy of one source in some receivers over time (as Fig. 14), with a band of one standard error.
+
+    Args:
+        mean, stderr, predicted: [time, receiver]; a prediction is drawn as dots in the color of what it predicts.
+        source, receivers: counted from 1, for the labels.
+        log: logarithmic shares.
+    """
+    for receiver in receivers:
+        column = (slice(None), receiver - 1)
+        curve(ax, times, mean[column], None if stderr is None else stderr[column], label=f"{source} to {receiver}")
+        if predicted is not None:
+            every = max(1, len(times) // 20)
+            ax.plot(times[::every], predicted[column][::every], "o", mfc="none", color=ax.lines[-1].get_color())
+    if predicted is not None:
+        ax.plot([], [], "o", mfc="none", color="0.3", label="model")
+    limits = {"yscale": "log", "ylim": (1e-4, 1.5)} if log else {"ylim": (0, 1.05)}
+    ax.set(xlabel=TIME_LABEL, ylabel="share of energy", **limits)
+    legend(ax)
     return ax
 
 
 def distance_curve(ax: Axes, times: np.ndarray, distance: np.ndarray, statistical: np.ndarray, title: str = "") -> Axes:
     """Total variation of model and ensemble over time, mean over sources and the worst, arrays [source, time]."""
-    curve(ax, times, distance.mean(0), label="model, mean over sources")
+    curve(ax, times, distance.mean(0), label="model, mean of sources")
     curve(ax, times, distance.max(0), label="model, worst source")
-    curve(ax, times, statistical.mean(0), label="two ensembles of this size", color="k", linestyle=":")
+    curve(ax, times, statistical.mean(0), label="two such ensembles", color="k", linestyle=":")
     ax.set(xlabel=TIME_LABEL, ylabel="total variation", title=title, ylim=(0, None))
-    ax.legend(fontsize="small")
+    legend(ax, columns=1)
     return ax
 
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import tomli_w
 import torch
 
-from torchchain import checks, plots
+from torchchain import checks
 from torchchain.cli import outputs
+from torchchain.cli.calibration_figure import Rates, calibration_figure, rates_of, sources_of
 from torchchain.cli.flags import Calibrate
+from torchchain.cli.report import shares_left
 from torchchain.cli.runs import Run, config_of, merged_tables, running, scene_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.scene import describe
@@ -24,7 +25,6 @@ from torchchain.ensemble.transfer import BandTransfer, band_transfer
 from torchchain.master import Calibration, MasterEquation, calibrate
 from torchchain.master.calibration import recipe
 from torchchain.master.ladder import methods
-from torchchain.master.paper_rates import paper_rates
 from torchchain.progress import log
 from torchchain.results import read_transfer
 
@@ -44,19 +44,21 @@ def run_calibrate(
             raise checks.fail(name, "not be given together with transfer, which is of a scene already", repr(name))
         path, transfer = read_transfer(flags.transfer)
         recipe(transfer, **settings)
+        shown = sources_of(flags.show, transfer.n_bands)
         with running(flags, arguments, loaded, options, keep=False) as run:
             source = {"transfer": {"path": str(path.resolve()), "sha256": outputs.sha256(path)}}
-            _leave(run, transfer, settings, None, source)
+            _leave(run, transfer, settings, None, source, shown)
         return
     scene = scene_of(config, flags)
     recipe(scene, **settings)  # before the ensemble is computed
+    shown = sources_of(flags.show, scene.n_bands)
     with running(flags, arguments, loaded, options, keep) as run:
         found = run.measured(band_transfer, scene)
         if found is not None:
             assert found.scene is not None, "of a simulation"
-            measured = replace(found.scene, observables=("band_energy", "long_time_band_energy"))
-            forecast = planning.forecast(measured, found.attributes, run.spent, float(found.stderr.max()))
-            _leave(run, found, settings, forecast, run.how(found.attributes))
+            ensemble = replace(found.scene, observables=("band_energy", "long_time_band_energy"))
+            forecast = planning.forecast(ensemble, found.attributes, run.spent, float(found.stderr.max()))
+            _leave(run, found, settings, forecast, run.how(ensemble, found.attributes), shown)
 
 
 def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:
@@ -73,8 +75,9 @@ def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:
 
 
 def _leave(
-    run: Run, transfer: BandTransfer, settings: dict[str, Any], forecast: dict[str, Any] | None, source: dict[str, Any]
-) -> None:
+    run: Run, transfer: BandTransfer, settings: dict[str, Any], forecast: dict[str, Any] | None, source: dict[str, Any],
+    shown: Sequence[int],
+) -> None:  # fmt: skip
     """Fit, predict, compare, draw, write and tell."""
     stages = run.stages
     with warnings.catch_warnings(record=True) as caught:
@@ -88,7 +91,8 @@ def _leave(
             rows = comparison(transfer, master, predicted)
         log.info("drawing and writing")
         with stages("figure"):
-            figure = calibration_figure(transfer, master, predicted)
+            rates = rates_of(transfer, master)
+            figure = calibration_figure(transfer, master, predicted, rates, shown)
     done = fitted(master)
     chosen = {**settings, "method": done.method, "model": done.model, "window": list(done.window or ())}
     scene = [] if transfer.scene is None or "transfer" in source else [transfer.scene.to_toml()]
@@ -96,11 +100,13 @@ def _leave(
     files = {
         "transfer.nc": outputs.dataset(transfer.to_dataset()),
         "model.safetensors": master.save,
-        "figure.png": outputs.figure(figure),
+        **outputs.figures(figure, run.flags.format),
     }
+    run.warned.extend(str(warning.message) for warning in caught)
     config = run.config(*scene, tomli_w.dumps({"calibration": chosen}))
     run.write(
-        files, config, seed=seed, **source, forecast=forecast, summary=dict(rows),
+        files, config, seed=seed, **{**source, "reasons": [*source.get("reasons", []), *_model_reasons(master)]},
+        forecast=forecast, title=title(transfer), summary=dict(rows), measured=measured(transfer, shown, rates),
         numbers=numbers(transfer, master, predicted),
     )  # fmt: skip
     print(title(transfer))
@@ -126,6 +132,32 @@ def title(transfer: BandTransfer) -> str:
         return describe(transfer.scene)
     words = transfer.provenance.words if transfer.provenance is not None else ""
     return f"{words or 'band transfer'}, {transfer.n_bands} bands, {len(transfer.times)} times"
+
+
+def _model_reasons(master: MasterEquation) -> list[str]:
+    """Why this model, with what the selection tried before."""
+    done = fitted(master)
+    chosen = done.report.selection
+    if chosen is None:
+        return [f"model '{done.model}', fitted by {done.method}, was asked for"]
+    tried = ", ".join(
+        f"'{rung.model}'{f' {rung.order}' if rung.order else ''} {rung.distance:.4f}" for rung in chosen.tried
+    )
+    halves = (
+        f" (two halves of the ensemble: {chosen.halves_distance:.4f})" if chosen.halves_distance is not None else ""
+    )
+    held_out = [f"total variation from the half held out: {tried}{halves}"] if tried else []
+    return [f"model '{done.model}': {chosen.reason}", *held_out]
+
+
+def measured(transfer: BandTransfer, shown: Sequence[int], rates: Rates) -> list[tuple[str, float, float | None]]:
+    """What is left in the bands of the figure at the last time, and their rates of loss, with standard errors."""
+    rows = shares_left(transfer, shown)
+    if rates.error is not None:
+        for source in shown:
+            loss = -float(rates.values[source - 1, source - 1])
+            rows.append((f"rate of loss of band {source}, {rates.meaning}", loss, float(rates.error[source - 1])))
+    return rows
 
 
 def comparison(transfer: BandTransfer, master: MasterEquation, predicted: torch.Tensor) -> list[tuple[str, Any]]:
@@ -178,46 +210,3 @@ def numbers(transfer: BandTransfer, master: MasterEquation, predicted: torch.Ten
     if transfer.damping == 0:
         found["conservation_defect"] = master.model.conservation_defect
     return found
-
-
-def calibration_figure(transfer: BandTransfer, master: MasterEquation, predicted: torch.Tensor) -> Any:
-    """Measured and predicted maps of two sources, decay curves, rates, and the distance over time."""
-    n = transfer.n_bands
-    low, high = max(1, round(n * 10 / 32)), max(1, round(n * 23 / 32))
-    times, mean, stderr = transfer.times.numpy(), transfer.mean.numpy(), transfer.stderr.numpy()
-    model = predicted.numpy()
-    figure, axes = plots.figure(13.5, 10, 3, 3)
-    for row, source in enumerate((low, high)):
-        plots.band_map(axes[row, 0], times, mean[source - 1], f"ensemble, source band {source}")
-        plots.band_map(axes[row, 1], times, model[source - 1], f"master equation, source band {source}")
-        other = max(1, source - 3)
-        pairs = list(dict.fromkeys([(source, source), (source, other)]))
-        plots.decay_comparison(axes[row, 2], times, mean, stderr, model, pairs, f"source band {source}")
-    rates, error, meaning = _rates(transfer, master)
-    plots.rate_map(axes[2, 0], rates, f"{meaning} (diagonal: loss)")
-    distance, noise = total_variation(predicted, transfer.mean), statistical_distance(transfer.stderr)
-    plots.distance_curve(axes[2, 1], times, distance.numpy(), noise.numpy(), "distance of model and ensemble")
-    ax = axes[2, 2]
-    bands = np.arange(1, n + 1)
-    ax.errorbar(bands, -rates.diagonal(), error, fmt="o", label="loss rate $-Q_{ss}$")
-    ax.plot(bands, rates.sum(-1) - rates.diagonal(), "-", label=r"$\sum_{r \neq s} Q_{sr}$")
-    ax.set(xlabel="source s", ylabel="rate", title="conservation")
-    ax.legend(fontsize="small")
-    done = fitted(master)
-    figure.suptitle(f"{title(transfer)}; model {done.model}, {done.method}")
-    return figure
-
-
-def _rates(transfer: BandTransfer, master: MasterEquation) -> tuple[np.ndarray, np.ndarray | None, str]:
-    """The paper's Q of the ensemble, the standard error of its diagonal, and its name; where it has none, the model's."""
-    try:
-        found = paper_rates(transfer)
-    except checks.FieldError:  # too few times early on, or an unknown disorder
-        return master.rates.detach().numpy(), None, master.rates_meaning
-    error = found["rates_stderr"].values.diagonal()
-    window = " to ".join(f"{time:g}" for time in found.attrs["window"])
-    return (
-        found["rates"].values,
-        error if np.isfinite(error).all() else None,
-        f"the paper's Q, procedure L, t = {window}",
-    )

@@ -117,6 +117,8 @@ class RunFlags(SceneFlags):
     """Flags of the commands that run an ensemble."""
 
     out: Annotated[str, flag("FOLDER")] = "results"
+    format: Annotated[str, flag(choices.FIGURES, "png")] = "png"
+    """of the figure, besides PNG"""
     device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
     """cpu, cuda, cuda:1, ..."""
     method: Annotated[str, flag(("auto", *choices.METHODS), "auto")] = "auto"
@@ -132,7 +134,7 @@ class Simulate(RunFlags):
     """Ensemble means of a scene's observables, with standard errors."""
 
     out: Annotated[str, flag("FOLDER", "results/simulate")] = "results/simulate"
-    """for config.toml, results.nc, figure.png and run.json"""
+    """for config.toml, results.nc, figure.png, report.html and run.json"""
 
 
 @dataclass(frozen=True)
@@ -153,8 +155,10 @@ class Calibrate(RunFlags):
     """adam: weight of the conservation penalty"""
     bootstrap: Annotated[int | None, flag("INT", "20, or none where fits take long")] = None
     """ensembles drawn again for the error bars, 0 for none"""
+    show: Annotated[str | None, flag("INT,INT", "10,23 of 32 bands")] = None
+    """source bands of the figure"""
     out: Annotated[str, flag("FOLDER", "results/calibrate")] = "results/calibrate"
-    """for config.toml, transfer.nc, model.safetensors, figure.png and run.json"""
+    """for config.toml, transfer.nc, model.safetensors, figure.png, report.html and run.json"""
     method: Annotated[str, flag(("auto", "theory", *choices.METHODS), "auto")] = "auto"
     """how to evolve the chains; auto for the plan's choice, theory for band energies without chains"""
 
@@ -187,7 +191,9 @@ class Predict:
     seed: Annotated[int | None, flag("INT")] = None
     """recorded only: a prediction draws no random number"""
     out: Annotated[str, flag("FOLDER", "results/predict")] = "results/predict"
-    """for config.toml, results.nc, figure.png and run.json"""
+    """for config.toml, results.nc, figure.png, report.html and run.json"""
+    format: Annotated[str, flag(choices.FIGURES, "png")] = "png"
+    """of the figure, besides PNG"""
     device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
     """cpu, cuda, cuda:1, ..."""
     plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()
@@ -239,7 +245,9 @@ class Compare:
     b: Annotated[str, tyro.conf.Positional, flag("FILE|FOLDER")]
     """the other"""
     out: Annotated[str, flag("FOLDER", "results/compare")] = "results/compare"
-    """for figure.png and run.json"""
+    """for figure.png, report.html and run.json"""
+    format: Annotated[str, flag(choices.FIGURES, "png")] = "png"
+    """of the figure, besides PNG"""
 
 
 @dataclass(frozen=True)
@@ -255,7 +263,9 @@ class Sweep:
     seed: Annotated[int | None, flag("INT", 0)] = None
     """seed of every ensemble"""
     out: Annotated[str, flag("FOLDER", "results/sweep")] = "results/sweep"
-    """for sweep.nc, sweep.csv, figure.png, run.json, and the folder of every run in runs"""
+    """for sweep.nc, sweep.csv, figure.png, report.html, run.json, and the folder of every run in runs"""
+    format: Annotated[str, flag(choices.FIGURES, "png")] = "png"
+    """of the figure, besides PNG"""
     device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
     """cpu, cuda, cuda:1, ..."""
     threads: Annotated[int | None, flag("INT", "all cores, shared by the processes that torchrun starts")] = None
@@ -307,7 +317,7 @@ class Import(FileFlags):
     long_time: Annotated[str, flag(("exact", "late"), "exact")] = "exact"
     """infinite-time average: from the modes of linear undamped rings, or over the later half of the times"""
     out: Annotated[str, flag("FOLDER", "results/import")] = "results/import"
-    """for config.toml, transfer.nc, figure.png and run.json"""
+    """for config.toml, transfer.nc, figure.png, report.html and run.json"""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import torch
 from torchchain import checks, plots
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
-from torchchain.cli import choices, outputs
+from torchchain.cli import choices, outputs, report
 from torchchain.cli.flags import Convert, FileFlags, Import
 from torchchain.energy.bands import check_bands
 from torchchain.ensemble.stages import Stages
@@ -52,7 +52,7 @@ def run_import(flags: Import, arguments: list[str]) -> None:
     began, stages = time.time(), Stages()
     _check(flags)
     files = files_of(flags)
-    with outputs.run_folder(flags.out) as out:
+    with outputs.run_folder(flags.out) as out, outputs.told_warnings() as warned:
         log.info("reading %d runs", len(files))
         with stages("frames"):
             frames, chains = _chains(flags, files)
@@ -67,22 +67,27 @@ def run_import(flags: Import, arguments: list[str]) -> None:
         assert transfer.provenance is not None
         hashes = {name: value for name, value in transfer.provenance.hashes.items() if name != "energies"}
         config = _config(flags, files)
-        record = outputs.run_record(
-            arguments, config, "cpu", began, stages.seconds, runs=runs, inputs=hashes, summary=transfer.attributes
+        condition = transfer.attributes["start_condition"]
+        starts = (
+            f"starts: {'one band each' if condition == 1 else f'mixed, least squares of condition {condition:.3g}'}"
         )
+        written = outputs.reported(
+            out, arguments, config, "cpu", began, stages.seconds, runs=runs, inputs=hashes, summary=transfer.attributes,
+            title=transfer.provenance.words, reasons=[*map(str, frames[:1]), starts], warnings=warned,
+            measured=report.shares_left(transfer, shown_bands(transfer.n_bands)),
+        )  # fmt: skip
         outputs.write(
             out,
             {
                 "config.toml": outputs.text(config),
                 "transfer.nc": outputs.dataset(transfer.to_dataset()),
-                "figure.png": outputs.figure(figure),
-                outputs.RECORD: record,
+                **outputs.figures(figure),
+                **written,
             },
         )
     print(transfer)
     print("masses: mean {mass_mean:.5f}, standard deviation {mass_sd:.5f}".format(**transfer.attributes))
-    condition = transfer.attributes["start_condition"]
-    print(f"starts: {'one band each' if condition == 1 else f'mixed, least squares of condition {condition:.3g}'}")
+    print(starts)
     print(f"{time.time() - began:.1f} s, results in {flags.out}")
 
 
@@ -301,20 +306,20 @@ def _transfer(
         raise checks.FieldError(f"{error} ({hint})") from None
 
 
+def shown_bands(n_bands: int) -> tuple[int, ...]:
+    """A low and a high band."""
+    return tuple(dict.fromkeys(max(1, round(n_bands * part / 3)) for part in (1, 2)))
+
+
 def _figure(transfer: BandTransfer) -> Any:
-    """Band maps of two sources, what stays in them and comes to their neighbors, and the infinite-time average."""
-    n = transfer.n_bands
-    low, high = max(1, round(n / 3)), max(1, round(n * 2 / 3))
+    """Band maps of two sources, and what stays in them and comes to their neighbors."""
+    n, shown = transfer.n_bands, shown_bands(transfer.n_bands)
     times, mean, stderr = transfer.times.numpy(), transfer.mean.numpy(), transfer.stderr.numpy()
-    figure, axes = plots.figure(9, 6.6, 2, 2)
-    for column, source in enumerate((low, high)):
-        plots.band_map(axes[0, column], times, mean[source - 1], f"source band {source}")
-        ax = axes[1, column]
-        for receiver in dict.fromkeys((source, max(1, source - 1), min(n, source + 1))):
-            index = (source - 1, slice(None), receiver - 1)
-            plots.curve(ax, times, mean[index], stderr[index], label=f"{source} to {receiver}")
-        ax.set(xlabel=plots.TIME_LABEL, ylabel="share of energy", ylim=(0, 1.05))
-        ax.legend(fontsize="small")
-    assert transfer.provenance is not None
-    figure.suptitle(transfer.provenance.words, fontsize="small")
+    with plots.style():
+        figure, axes = plots.figure(plots.COLUMN * len(shown), 4.8, 2, len(shown))
+        for column, source in enumerate(shown):
+            plots.band_map(axes[0, column], times, mean[source - 1], f"source {source}")
+            near = dict.fromkeys((source, max(1, source - 1), min(n, source + 1)))
+            plots.decays(axes[1, column], times, mean[source - 1], stderr[source - 1], source, list(near), log=False)
+        plots.lettered(axes.flat)
     return figure

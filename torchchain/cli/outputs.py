@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import metadata
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from torchchain import checks
+from torchchain.cli import report
 from torchchain.ensemble.ranks import rank_of_environment
 from torchchain.locks import lock
 from torchchain.progress import log
@@ -166,12 +168,52 @@ def _require_room(path: Path, size: int) -> None:
 
 
 def figure(drawn: Any) -> Writer:
-    """A writer of a matplotlib figure, as PNG."""
+    """A writer of a matplotlib figure, in the format of the file's ending."""
 
     def writer(path: Path) -> None:
-        drawn.savefig(path, dpi=150)
+        drawn.savefig(path, dpi=200)
 
     return writer
+
+
+def figures(drawn: Any, kind: str = "png") -> dict[str, Writer]:
+    """The figure as PNG, which the report shows, and in the other format that is asked for."""
+    return {f"figure.{ending}": figure(drawn) for ending in dict.fromkeys(("png", kind))}
+
+
+@contextmanager
+def told_warnings() -> Iterator[list[str]]:
+    """The warnings that are shown until this ends, in words, for the record; they are shown all the same."""
+    told: list[str] = []
+    show = warnings.showwarning
+
+    def noted(message: Warning | str, *where: Any, **more: Any) -> None:
+        told.append(" ".join(str(message).split()))
+        show(message, *where, **more)
+
+    warnings.showwarning = noted
+    try:
+        yield told
+    finally:
+        warnings.showwarning = show
+
+
+def reported(
+    out: Path, arguments: Sequence[str], config: str, device: str, began: float, stages: dict[str, float], **more: Any
+) -> dict[str, Writer]:
+    """The writers of report.html and of run.json, to be written last.
+
+    Args:
+        out: the folder of the run.
+        arguments, config, device, began, stages, more: of the record; for the report also what :func:`report.page` tells.
+    """
+    record = _record(arguments, config, device, began, stages, more)
+
+    def page(path: Path) -> None:
+        told = report.page({**record, "out": str(out.absolute())}, path.parent)
+        path.write_text(told, encoding="utf-8")
+
+    return {report.REPORT: page, RECORD: _recorded(record)}
 
 
 def run_record(
@@ -181,7 +223,13 @@ def run_record(
 
     Command and folder it was given in, hashes of config and files, versions, device, threads, durations, git revision.
     """
-    record: dict[str, Any] = {
+    return _recorded(_record(arguments, config, device, began, stages, more))
+
+
+def _record(
+    arguments: Sequence[str], config: str, device: str, began: float, stages: dict[str, float], more: dict[str, Any]
+) -> dict[str, Any]:
+    return {
         "command": shlex.join(["torchchain", *arguments]),
         "arguments": list(arguments),
         "working_directory": os.getcwd(),
@@ -197,6 +245,8 @@ def run_record(
         **more,
     }
 
+
+def _recorded(record: dict[str, Any]) -> Writer:
     def writer(path: Path) -> None:
         record["files"] = {beside.name: sha256(beside) for beside in sorted(path.parent.iterdir())}
         path.write_text(json.dumps(_strict(record), indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -12,7 +12,7 @@ import tomli_w
 import torch
 
 from torchchain import checks, plots
-from torchchain.cli import outputs
+from torchchain.cli import choices, outputs
 from torchchain.cli.flags import Predict
 from torchchain.cli.runs import config_of, merged_tables
 from torchchain.ensemble.scene import regular_times
@@ -34,13 +34,14 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
     checks.known_keys("predict", given, PREDICT_KEYS)
     checks.choice("method", flags.method, SOLVERS)
     device = str(checks.device("device", flags.device))
-    with outputs.run_folder(flags.out) as out:
-        _predict(flags, given, loaded, out, device, arguments, began)
+    checks.choice("format", flags.format, choices.FIGURES)
+    with outputs.run_folder(flags.out) as out, outputs.told_warnings() as warned:
+        _predict(flags, given, loaded, out, device, arguments, began, warned)
 
 
 def _predict(
     flags: Predict, given: Mapping[str, Any], loaded: list[str], out: Path, device: str, arguments: list[str],
-    began: float,
+    began: float, warned: list[str],
 ) -> None:  # fmt: skip
     stages, path = Stages(), model_file(flags.model)
     with stages("loading"):
@@ -56,15 +57,17 @@ def _predict(
     if loaded:
         request["plugins"] = loaded
     text = tomli_w.dumps({**request, "times": times.tolist()})
-    record = outputs.run_record(
-        arguments, text, device, began, stages.seconds, seed=flags.seed, method=flags.method,
+    written = outputs.reported(
+        out, arguments, text, device, began, stages.seconds, seed=flags.seed, method=flags.method, warnings=warned,
         model={"path": str(path.resolve()), "sha256": digest},
+        title=f"prediction of {len(labels)} starts to t = {float(times[-1]):g}",
+        reasons=[f"solved by {flags.method}", *repr(master).splitlines()[1:]],
     )  # fmt: skip
     files = {
         "config.toml": outputs.text(text),
         "results.nc": outputs.dataset(data),
-        "figure.png": outputs.figure(_figure(starts, labels, times, energy)),
-        outputs.RECORD: record,
+        **outputs.figures(_figure(starts, labels, times, energy), flags.format),
+        **written,
     }
     outputs.write(out, files)
     print(f"{len(labels)} starts, {len(times)} times to {float(times[-1]):g}, solved by {flags.method}")
@@ -145,8 +148,10 @@ def _dataset(
 
 def _figure(starts: torch.Tensor, labels: list[str], times: torch.Tensor, energy: torch.Tensor) -> Any:
     shown = [0] if len(labels) == 1 else [round((len(labels) - 1) * f) for f in (10 / 32, 23 / 32)]
-    figure, axes = plots.figure(5.5 * len(shown), 4, 1, len(shown))
-    for ax, index in zip(axes[0], shown, strict=True):
-        total = float(starts[index].sum()) or 1.0
-        plots.band_map(ax, times.numpy(), energy[index].numpy() / total, f"start: {labels[index]}")
+    with plots.style():
+        figure, axes = plots.figure(plots.COLUMN * len(shown), 2.7, 1, len(shown))
+        for ax, index in zip(axes[0], shown, strict=True):
+            total = float(starts[index].sum()) or 1.0
+            plots.band_map(ax, times.numpy(), energy[index].numpy() / total, f"start: {labels[index]}")
+        plots.lettered(axes.flat if len(shown) > 1 else ())
     return figure

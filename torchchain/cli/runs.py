@@ -14,7 +14,7 @@ import tomli_w
 import torch
 
 from torchchain import checks
-from torchchain.cli import outputs, plugins
+from torchchain.cli import choices, outputs, plugins
 from torchchain.cli.flags import Calibrate, RunFlags, SceneFlags
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble import ranks
@@ -49,6 +49,7 @@ class Run:
         plugins: that were loaded.
         options: of the method, where a record is followed.
         checkpoint: None where nothing is to be kept.
+        warned: the warnings so far, in words.
     """
 
     flags: RunFlags
@@ -62,6 +63,7 @@ class Run:
     began: float = field(default_factory=time.time)
     spent: float = 0.0
     group: ranks.Ranks = ranks.ALONE
+    warned: list[str] = field(default_factory=list)
 
     def measured(self, measure: Callable[..., Measured], scene: Scene) -> Measured | None:
         """What :func:`simulate` or :func:`band_transfer` finds, on the first of the processes that share the work."""
@@ -74,15 +76,22 @@ class Run:
             self.spent = time.time() - before
         return None if self.group.rank else found
 
-    def how(self, attributes: Mapping[str, Any]) -> dict[str, Any]:
-        """What the record says of the ensemble: the method asked for and the one used, processes, what was taken over."""
+    def how(self, scene: Scene, attributes: Mapping[str, Any]) -> dict[str, Any]:
+        """What the record says of the ensemble: the method asked for and the one used, why, processes, what was taken over."""
         return {
             "method": self.flags.method,
+            "reasons": self._reasons(scene, attributes["method"]),
             "resolved": {"method": attributes["method"], "options": json.loads(attributes["method_options"])},
             "processes": self.group.size,
             "resumed_realizations": self.checkpoint.resumed if self.checkpoint is not None else 0,
             "realized": {name: attributes[name] for name in ("mass_mean", "mass_sd")},
         }
+
+    def _reasons(self, scene: Scene, used: str) -> list[str]:
+        if self.flags.method != "auto":
+            return [f"'{used}' was asked for"]
+        plan = planning.plan(scene)
+        return list(plan.reasons) if plan.method == used else [f"'{used}' was begun with, and kept"]
 
     def config(self, *tables: str) -> str:
         """The resolved config: the plugins, and the tables of the run."""
@@ -92,12 +101,12 @@ class Run:
     def write(self, files: dict[str, outputs.Writer], config: str, **record: Any) -> None:
         """Leave the files, the config and the record in the folder, and clear the checkpoint."""
         hashes = {name: outputs.sha256(name) for name in self.plugins if name.endswith(".py")}
-        written = outputs.run_record(
-            self.arguments, config, self.device, self.began, self.stages.seconds,
+        written = outputs.reported(
+            self.out, self.arguments, config, self.device, self.began, self.stages.seconds, warnings=self.warned,
             **({"plugins": hashes} if self.plugins else {}), **record,
         )  # fmt: skip
         with self.stages("writing"):
-            outputs.write(self.out, {"config.toml": outputs.text(config), **files, outputs.RECORD: written})
+            outputs.write(self.out, {"config.toml": outputs.text(config), **files, **written})
         if self.checkpoint is not None:
             self.checkpoint.clear()
 
@@ -114,11 +123,12 @@ def running(
     """A run whose flags are checked and whose folder is its own; an interrupt tells of what is kept."""
     began = time.time()
     device = str(checks.device("device", ranks.own_device(flags.device)))
+    checks.choice("format", flags.format, choices.FIGURES)
     checks.choice("method", flags.method, ("auto", *METHODS, *([THEORY] if isinstance(flags, Calibrate) else [])))
-    with outputs.run_folder(flags.out) as out:
+    with outputs.run_folder(flags.out) as out, outputs.told_warnings() as told:
         checkpoint = Checkpoint(out / "checkpoint", flags.checkpoint_every) if keep else None
         try:
-            yield Run(flags, arguments, out, device, loaded, options, checkpoint, began=began)
+            yield Run(flags, arguments, out, device, loaded, options, checkpoint, began=began, warned=told)
         except Interrupted:
             raise
         except KeyboardInterrupt:

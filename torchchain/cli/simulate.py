@@ -38,20 +38,37 @@ def run_simulate(
 
 def _leave(run: Run, scene: Scene, data: xarray.Dataset) -> None:
     forecast = planning.forecast(scene, data.attrs, run.spent, _largest_error(data, scene.observables))
-    with run.stages("figure"):
+    with run.stages("figure"), plots.style():
         figure = _figure(scene, data)
-    files = {"results.nc": outputs.dataset(data), "figure.png": outputs.figure(figure)}
-    run.write(files, run.config(scene.to_toml()), seed=scene.seed, forecast=forecast, **run.how(data.attrs))
+    files = {"results.nc": outputs.dataset(data), **outputs.figures(figure, run.flags.format)}
+    masses = f"mean {data.attrs['mass_mean']:.6f}, standard deviation {data.attrs['mass_sd']:.6f}"
+    last = [row for name in scene.observables if (row := _last(data, name)) is not None]
+    run.write(
+        files, run.config(scene.to_toml()), seed=scene.seed, forecast=forecast, title=describe(scene),
+        summary={"masses": masses}, measured=last, **run.how(scene, data.attrs),
+    )  # fmt: skip
     print(describe(scene))
     run.told(forecast)
-    print(f"masses: mean {data.attrs['mass_mean']:.6f}, standard deviation {data.attrs['mass_sd']:.6f}")
-    for name in scene.observables:
-        last = data[name].isel(time=-1) if "time" in data[name].dims else data[name]
-        error = data[f"{name}_stderr"]
-        error = error.isel(time=-1) if "time" in error.dims else error
-        if last.ndim == 0:
-            print(f"{name} at the last time: {float(last):.6g} +- {float(error):.2g}")
+    print(f"masses: {masses}")
+    for name, value, error in last:
+        print(f"{name}: {value:.6g} +- {error:.2g}")
     print(f"{time.time() - run.began:.1f} s, results in {run.flags.out}")
+
+
+def _last(data: xarray.Dataset, name: str) -> tuple[str, float, float] | None:
+    """An observable at the last time and its standard error: the number, or the largest of several, where there is one axis."""
+    values, error = data[name], data[f"{name}_stderr"]
+    when = " at the last time" if "time" in values.dims else ""
+    if when:
+        values, error = values.isel(time=-1), error.isel(time=-1)
+    if values.ndim > 1:
+        return None
+    if values.ndim:
+        place = int(values.values.argmax())
+        axis = values.dims[0]
+        values, error = values[place], error[place]
+        when += f", largest ({axis} {float(data[axis][place]):g})"
+    return f"{name}{when}", float(values), float(error)
 
 
 def _largest_error(data: xarray.Dataset, names: Sequence[str]) -> float:
@@ -61,7 +78,7 @@ def _largest_error(data: xarray.Dataset, names: Sequence[str]) -> float:
 
 def _figure(scene: Scene, data: xarray.Dataset) -> Any:
     names = list(scene.observables)
-    figure, axes = plots.figure(6, 3.6 * len(names), len(names), 1)
+    figure, axes = plots.figure(plots.COLUMN, 2.6 * len(names) + 0.2, len(names), 1)
     times = scene.times.numpy()
     for ax, name in zip(axes[:, 0], names, strict=True):
         values, error = data[name], data[f"{name}_stderr"]
@@ -69,25 +86,22 @@ def _figure(scene: Scene, data: xarray.Dataset) -> Any:
         if "tone" in values.dims:
             values, error = (part.isel(tone=len(scene.tones) // 2) for part in (values, error))
             chosen = f"tone {int(values.tone)}"
-        label = f"{values.attrs['long_name']} ({values.attrs['units']})"
+        label = plots.label_of(values)
         if name == "band_energy":
             plots.band_map(ax, times, values.values, title=chosen)
         elif values.ndim == 2:
             axis = values.dims[1]
             plots.field_map(
-                ax, times, data[axis].values, values.values, plots.TIME_LABEL, _label(data, axis), label, chosen,
+                ax, times, data[axis].values, values.values, plots.TIME_LABEL, plots.label_of(data[axis]), label, chosen,
                 signed=name == "displacement",
             )  # fmt: skip
         elif values.ndim == 1:
             axis = values.dims[0]
             plots.curve(ax, data[axis].values, values.values, error.values)
-            ax.set(xlabel=_label(data, axis), ylabel=label, title=chosen)
+            ax.set(xlabel=plots.label_of(data[axis]), ylabel=label, title=chosen)
         else:
             ax.set_axis_off()
             ax.text(0.5, 0.5, f"{label}: axes {', '.join(map(str, values.dims))}", ha="center")
-    figure.suptitle(describe(scene), fontsize="small")
+    if len(names) > 1:
+        plots.lettered(axes.flat)
     return figure
-
-
-def _label(data: xarray.Dataset, axis: Any) -> str:
-    return str(data[axis].attrs.get("long_name", axis))

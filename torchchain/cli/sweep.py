@@ -20,7 +20,7 @@ import numpy as np
 import tomli_w
 
 from torchchain import checks, plots
-from torchchain.cli import outputs
+from torchchain.cli import choices, outputs
 from torchchain.cli.calibrate import run_calibrate
 from torchchain.cli.flags import Calibrate, Simulate, Sweep
 from torchchain.cli.runs import config_of
@@ -50,6 +50,7 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
     """Run every combination that has not been run, then leave all results in one file, a table and a figure."""
     began = time.time()
     checks.choice("command", flags.command, ("simulate", "calibrate"))
+    checks.choice("format", flags.format, choices.FIGURES)
     config, loaded = config_of(flags.config, flags.plugin)
     if flags.seed is not None:
         config["seed"] = flags.seed
@@ -61,7 +62,7 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
     for point in points:  # all of them before the first is run
         tables = ("plugins", *(["calibration"] if flags.command == "calibrate" else []))
         Scene.from_dict({name: value for name, value in point.config.items() if name not in tables})
-    with outputs.run_folder(flags.out) as out, _cleared_if_empty(out / "runs", out):
+    with outputs.run_folder(flags.out) as out, _cleared_if_empty(out / "runs", out), outputs.told_warnings() as warned:
         for number, point in enumerate(points, 1):
             folder, text = out / "runs" / point.name, tomli_w.dumps(point.config)
             if _done(folder, text):
@@ -84,13 +85,17 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
         rows = [_row(folder.record) for folder in folders]
         data = combined(fields, [folder.data for folder in folders], rows)
         text = tomli_w.dumps({**config, "sweep": {name: list(values) for name, values in fields.items()}})
-        record = outputs.run_record(
-            arguments, text, flags.device, began, {}, seed=config.get("seed", 0), runs=[point.name for point in points]
-        )
+        with plots.style():
+            figure = _figure(fields, data)
+        written = outputs.reported(
+            out, arguments, text, flags.device, began, {}, seed=config.get("seed", 0), runs=[point.name for point in points],
+            title=f"{len(points)} runs of {flags.command} over {', '.join(fields)}", warnings=warned,
+            reasons=["every run has a report of its own in the folder runs", *left_out(data)],
+        )  # fmt: skip
         outputs.write(out, {
             "config.toml": outputs.text(text), "sweep.nc": outputs.dataset(data),
-            "sweep.csv": outputs.text(_table(fields, points, rows)), "figure.png": outputs.figure(_figure(fields, data)),
-            outputs.RECORD: record,
+            "sweep.csv": outputs.text(_table(fields, points, rows)), **outputs.figures(figure, flags.format),
+            **written,
         })  # fmt: skip
     print(
         f"{len(points)} runs of {flags.command} over {', '.join(fields)}; {time.time() - began:.1f} s, results in {flags.out}"
@@ -206,6 +211,11 @@ def combined(
     return xarray.Dataset(variables, coords, {"left_out": ", ".join(left_out)})
 
 
+def left_out(data: xarray.Dataset) -> list[str]:
+    """What is not in the one file, in words."""
+    return [f"with axes that differ between the runs, and only in theirs: {data.left_out}"] if data.left_out else []
+
+
 def _table(fields: Mapping[str, Any], points: Sequence[Point], rows: Sequence[Mapping[str, float]]) -> str:
     """The runs as comma-separated values: swept fields, then the numbers that sum them up."""
     names = list(dict.fromkeys(name for row in rows for name in row))
@@ -221,9 +231,8 @@ def _figure(fields: Mapping[str, Sequence[Any]], data: xarray.Dataset) -> Any:
     """The numbers that sum the runs up over the first field, one line for each combination of the others."""
     names = [str(name) for name in data.data_vars if str(name).startswith("run_")][:MOST_PANELS]
     columns = min(3, len(names))
-    figure, axes = plots.figure(
-        4.2 * columns, 3.2 * math.ceil(len(names) / columns), math.ceil(len(names) / columns), columns
-    )
+    rows = math.ceil(len(names) / columns)
+    figure, axes = plots.figure(plots.PAGE * columns / 3, 2.4 * rows, rows, columns)
     first, *others = fields
     numeric = all(isinstance(value, (int, float)) for value in fields[first])
     x = fields[first] if numeric else range(len(fields[first]))
@@ -231,12 +240,13 @@ def _figure(fields: Mapping[str, Sequence[Any]], data: xarray.Dataset) -> Any:
         for chosen in itertools.product(*(range(len(fields[other])) for other in others)):
             line = data[name].isel(dict(zip(others, chosen, strict=True)))
             label = ", ".join(f"{other} = {fields[other][i]}" for other, i in zip(others, chosen, strict=True))
-            ax.plot(x, line.values, "o-", ms=3, label=label or None)
+            ax.plot(x, line.values, marker="o", label=label or None)
         ax.set(xlabel=first, ylabel=name.removeprefix("run_").replace("_", " "))
         if not numeric:
             ax.set_xticks(list(x), [str(value) for value in fields[first]])
     if others and names:
-        axes.flat[0].legend(fontsize="x-small")
+        figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     for ax in list(axes.flat)[len(names) :]:
         ax.set_axis_off()
+    plots.lettered(axes.flat)
     return figure

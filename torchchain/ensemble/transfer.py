@@ -9,14 +9,14 @@ import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import xarray
 from torch import Tensor
 
-from torchchain import checks
+from torchchain import checks, plots
 from torchchain._version import __version__
 from torchchain.chain.chain import Chain
 from torchchain.chain.excitation import StandingWave
@@ -38,6 +38,9 @@ from torchchain.network import Network
 from torchchain.theory.law import law_of
 from torchchain.theory.transfer import theory_transfer
 from torchchain.threads import single_thread
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 THEORY = "theory"
 """The method of a transfer without chains."""
@@ -182,6 +185,48 @@ class BandTransfer(Printed):
             "long_time": known,
             **method,
         }
+
+    def plot(
+        self, source: int, receivers: Sequence[int] | None = None, log: bool = True, ax: Axes | None = None
+    ) -> Axes:
+        """The share of a source's energy in some bands over time (as Fig. 14), with a band of one standard error.
+
+        Args:
+            source: band, counted from 1.
+            receivers: bands, counted from 1; the source and its neighbors if left out.
+            log: logarithmic shares.
+            ax: where to draw; None for a figure of its own, a column wide.
+
+        Returns:
+            The axes; ``ax.figure.savefig(...)`` writes them.
+
+        Raises:
+            FieldError: for a band that is none of 1 to ``n_bands``.
+        """
+        source = checks.integer("source", source, 1, self.n_bands)
+        near = range(max(1, source - 1), min(self.n_bands, source + 1) + 1) if receivers is None else receivers
+        bands = [checks.integer("receivers", receiver, 1, self.n_bands) for receiver in near]
+        mean, stderr = self.mean[source - 1].numpy(), self.stderr[source - 1].numpy()
+        ax = plots.own_axes() if ax is None else ax
+        return plots.decays(ax, self.times.numpy(), mean, stderr, source, bands, log=log)
+
+    def plot_map(self, source: int | None = None, ax: Axes | None = None) -> Axes:
+        """Shares of the energy as colors: of one source over time and band (Fig. 12), or of all pairs of bands in the end.
+
+        Args:
+            source: band, counted from 1; None for all sources at infinite time, or, where that is not known, the last time.
+            ax: where to draw; None for a figure of its own, a column wide.
+
+        Raises:
+            FieldError: for a band that is none of 1 to ``n_bands``.
+        """
+        ax = plots.own_axes() if ax is None else ax
+        if source is not None:
+            mean = self.mean[checks.integer("source", source, 1, self.n_bands) - 1]
+            return plots.band_map(ax, self.times.numpy(), mean.numpy(), f"source {source}")
+        if self.long_time is not None:
+            return plots.share_matrix(ax, self.long_time.numpy(), "infinite time")
+        return plots.share_matrix(ax, self.mean[:, -1].numpy(), f"$t$ = {float(self.times[-1]):g}")
 
     def to_dataset(self) -> xarray.Dataset:
         """Labeled axes and units, for netCDF; :meth:`from_dataset` reads it back."""

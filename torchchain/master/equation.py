@@ -6,12 +6,12 @@ import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from torchchain import checks
+from torchchain import checks, plots
 from torchchain.chain.excitation import StandingWave
 from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.scene import Scene, describe
@@ -25,6 +25,9 @@ from torchchain.master.report import Calibration, Report
 from torchchain.master.solving import SOLVERS, IntegrationError
 from torchchain.master.uncertainty import Uncertainty
 from torchchain.threads import single_thread
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NEGATIVE_SHARE = 1e-3
 """Negative energies of a band up to this share of the total are not worth a warning."""
@@ -287,6 +290,11 @@ class MasterEquation(Printed, nn.Module):
                 f"{scene.n_particles} particles, calibrated on {own.n_particles}, and waves that go round by t = {shorter}"
             )
         return [*found, *_other_start(scene, own)]
+
+    def plot_rates(self, ax: Axes | None = None) -> Axes:
+        """:attr:`rates` as colors (Fig. 17), the diagonal as rates of loss -Q_ss, on axes of a figure of its own if none are given."""
+        ax = plots.own_axes() if ax is None else ax
+        return plots.rate_map(ax, self.rates.detach().cpu().numpy(), self.rates_meaning)
 
     def coarsened(self, n_bands: int) -> MasterEquation:
         """The model of fewer and wider bands, each of several of the present ones, for energy spread evenly in a band.
