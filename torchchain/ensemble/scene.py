@@ -130,8 +130,9 @@ class Scene(Printed):
 
         if self.lattice is None:
             for name, default in OF_LATTICES.items():
-                if getattr(self, name) != default:
-                    raise checks.fail(name, "be left out without a lattice", checks.shown(getattr(self, name)))
+                value = getattr(self, name)
+                if not (value is default or (isinstance(value, (str, int, float)) and value == default)):
+                    raise checks.fail(name, "be left out without a lattice", checks.shown(value))
             put("n_particles", 256 if self.n_particles is None else self.n_particles)
             put("n_bands", 32 if self.n_bands is None else self.n_bands)
         else:
@@ -401,6 +402,9 @@ class Scene(Printed):
         m/s, ``amplitude`` in meters and ``damping`` in kg/s, in place of the dimensionless fields.
         """
         checks.known_keys("scene", plain, [entry.name for entry in dataclasses.fields(cls)])
+        for name in ("n_particles", "n_bands"):
+            if name in plain and plain[name] is None:
+                raise checks.FieldTypeError(f"{name} must be an integer, got None")
         fields = dict(plain)
         if "si" in fields:
             fields = _made_dimensionless(fields)

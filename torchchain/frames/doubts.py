@@ -134,7 +134,13 @@ def check_energy(name: str, chain: Chain | Network, path: Trajectory) -> None:
 
 
 def check_opening(name: str, chain: Chain, path: Trajectory) -> None:
-    """A warning for contacts that open; arguments as for :func:`check_energy`, (time, particle)."""
+    """A warning for contacts that open; arguments as for :func:`check_energy`, (time, particle).
+
+    Example:
+        >>> chain = tc.Chain([1.0, 1.0, 1.0])
+        >>> path = tc.evolve(chain, tc.impulse(chain, site=2, velocity=0.01), [0.0, 1.0], method="modes")
+        >>> tc.frames.check_opening("run.dump", chain, path)  # stretched by 0.006, the overlap being 1: no warning
+    """
     stretch = chain.elongation(path.displacement)
     if float(stretch.max()) >= 1:
         k = int(stretch.amax(-1).argmax())

@@ -180,7 +180,7 @@ def _replicates(bootstrap: int | None, fit: Fit | None, transfer: BandTransfer) 
             "bootstrap", "be 0 for one realization (error bars need runs on at least 2 chains for every source)", count
         )
     if count == 1:
-        raise checks.fail("bootstrap", "be 0 or at least 2", count)
+        raise checks.fail("bootstrap", "be 0, or at least 2", count)
     return count
 
 

@@ -26,6 +26,11 @@ class PackingBands:
         n_shells: per polarization.
         largest: |q| of the last shell's end.
         polarizations: ("longitudinal", "transverse"), or ("scalar",).
+
+    Example:
+        >>> bands = tc.network.PackingBands(2, 1.0, ("longitudinal", "transverse"))
+        >>> bands.n_bands, bands.edges.tolist(), bands.labels[-2:]
+        (5, [0.0, 0.5, 1.0], ('transverse 2', 'other'))
     """
 
     n_shells: int
@@ -92,6 +97,20 @@ def packing_band_energy(
         trajectory: displacement and velocity (*batch, time, particle, component).
         bands: of :func:`packing_bands`.
         normalize: divide by the total energy.
+
+    Returns:
+        (*batch, time, band), in units of energy unless normalized.
+
+    Raises:
+        FieldError: for no energy to divide by.
+
+    Example:
+        >>> grid = tc.lattice("square", (12, 12), "scalar")
+        >>> start = tc.network.plane_wave(grid, (1, 0), "scalar")  # the longest of the box
+        >>> still = tc.evolve(grid, start, [0.0], method="modes")
+        >>> bands = tc.network.packing_bands(grid, 2)
+        >>> tc.network.packing_band_energy(grid, still, bands).squeeze().round(decimals=9).tolist()
+        [1.0, 0.0, 0.0]
     """
     waves = plane_wave_energy(network, trajectory, bands.largest)
     shells = shell_energy(waves.lengths, waves.energy, bands.edges).transpose(-2, -1).flatten(-2)
