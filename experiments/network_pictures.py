@@ -14,14 +14,16 @@ import numpy as np
 import torch
 import xarray
 from harness import Row
-from matplotlib.animation import PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
+from PIL import Image
 
 import torchchain as tc
 from torchchain import network as nw
 from torchchain.chain import State
+
+COLORS = 64  # of the animation
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         data.time, data.edges, data.shells.sum("polarization").values[:-1].T, cmap="viridis", vmax=0.2
     )
     figure.colorbar(image, ax=axis, label="share of the energy")
-    axis.set(xlabel="t", ylabel="|q|", title="energy of a plane wave over wavenumber")
+    axis.set(xlabel="t", ylabel="|q|", title="a plane wave: energy over |q|")
     for axis, name, p in ((axes[1, 1], "longitudinal", 0), (axes[1, 2], "transverse", 1)):
         image = axis.pcolormesh(
             data.q, data.w, np.log10(data.spectrum.values[p].T.clip(1e-3)), cmap="viridis", vmin=-1.5
@@ -183,17 +185,22 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
 
 
 def animate(data: xarray.Dataset, file: Path) -> None:
-    """The kick as a GIF."""
+    """The kick as a GIF of few colors, the same in all pictures."""
     figure = Figure(figsize=(4, 4), layout="constrained")
-    FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(90)
     axis = figure.subplots()
     drawn = disks(axis, data, data.movie.values[0])
-    writer = PillowWriter(fps=8)
-    with writer.saving(figure, str(file), dpi=80):
-        for t, energy in zip(data.time.values, data.movie.values, strict=True):
-            drawn.set_array(np.abs(energy) ** 0.25)
-            axis.set_title(f"t = {t:.0f}")
-            writer.grab_frame()
+    pictures = []
+    for t, energy in zip(data.time.values, data.movie.values, strict=True):
+        drawn.set_array(np.abs(energy) ** 0.25)
+        axis.set_title(f"t = {t:.0f}")
+        canvas.draw()
+        pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+    sheet = Image.fromarray(np.concatenate([np.asarray(picture) for picture in pictures[:8]]))
+    colors = sheet.quantize(COLORS, Image.Quantize.MAXCOVERAGE)
+    pictures = [picture.quantize(palette=colors, dither=Image.Dither.NONE) for picture in pictures]
+    pictures[0].save(file, save_all=True, append_images=pictures[1:], duration=125, loop=0)
 
 
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:
