@@ -23,7 +23,6 @@ version = release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery", "pages"]
 exclude_patterns = [
     "_build",
-    "notebooks.md",
     "_ext",
     "concepts",
     "gallery",
