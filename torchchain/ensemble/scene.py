@@ -50,7 +50,7 @@ class Scene(Printed):
     ==================  ===============================================  =================================================
     n_particles         N                                                left out: the product of ``shape``
     boundary            "periodic" or "fixed"                            "periodic", "fixed" or "free"
-    n_bands             equal bands of |k|, a divisor of N/2             equal shells of |q| times polarizations (even for
+    n_bands             equal bands of k, a divisor of N/2               equal shells of q times polarizations (even for
                                                                          motion "vector"), the longitudinal ones first
     tones               of standing waves, k = 2 pi tone / N             bands whose plane wave starts: that nearest to the
                                                                          middle of the shell, along its polarization
