@@ -727,6 +727,10 @@ def test_energy_that_drifts(motion, file):
     with pytest.raises(checks.FieldError, match="chain must have masses of shape"):
         found.trajectory(still, chain=tc.Chain(chain.masses[1:]))
     warned("energy: .* another stiffness", lambda: check_energy("run", replace(chain, stiffness=2.0), path))
+    later = torch.where(path.times > 0, 1.0, 0.5)[:, None]  # a kick after the first frame
+    kicked = replace(path, displacement=path.displacement * later, velocity=path.velocity * later)
+    with pytest.raises(checks.FieldError, match=r"run, frame \d: energy must be that of the first frame, got .* units"):
+        check_energy("run", chain, kicked)
 
 
 def test_displacements_above_the_overlap(motion, file, at_rest):

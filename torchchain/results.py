@@ -18,7 +18,7 @@ from torchchain.master import MasterEquation, MasterFamily
 if TYPE_CHECKING:
     import xarray
 
-DATA = ("results.nc", "transfer.nc")
+DATA = ("results.nc", "transfer.nc", "sweep.nc")
 MODEL = "model.safetensors"
 
 
@@ -30,8 +30,8 @@ class RunFolder:
         path: of the folder.
         record: run.json: command, seed, versions, device, seconds, hashes of the files.
         config: config.toml, the resolved settings.
-        scene: of the ensemble; None where the config holds none (a family, a prediction, imported data).
-        data: results.nc or transfer.nc, with labeled axes and units.
+        scene: of the ensemble; None where the config holds none (a family, a prediction, imported data, a sweep).
+        data: results.nc, transfer.nc or sweep.nc, with labeled axes and units.
         transfer: the band transfer that calibrate measured, or was given.
         master: the calibrated master equation; of a prediction's folder the one it was solved with.
         family: the models that ``torchchain family`` joined.
@@ -73,14 +73,14 @@ class RunFolder:
         if (self.path / "transfer.nc").is_file():
             return self.transfer.scene
         fields = {name: value for name, value in self.config.items() if name != "plugins"}
-        return Scene.from_dict(fields) if "n_particles" in fields else None
+        return Scene.from_dict(fields) if "n_particles" in fields and "sweep" not in fields else None
 
     @cached_property
     def data(self) -> xarray.Dataset:
         for name in DATA:
             if (self.path / name).is_file():
                 return read_dataset(self.path / name)
-        raise checks.fail(f"folder {self.path}", f"hold {' or '.join(DATA)}", "neither")
+        raise checks.fail(f"folder {self.path}", f"hold {' or '.join(DATA)}", "none of them")
 
     @cached_property
     def transfer(self) -> BandTransfer:

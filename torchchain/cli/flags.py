@@ -282,8 +282,14 @@ class FileFlags:
     """of the files"""
     time_step: Annotated[float | None, flag("FLOAT")] = None
     """time between two step numbers, for dumps that do not state their times"""
-    masses: Annotated[str | None, flag("FLOAT|FILE")] = None
-    """where the files have none: of every particle, or a MercuryDPM .restart file"""
+    masses: Annotated[str | None, flag("FLOAT|TYPE=FLOAT,...|FILE")] = None
+    """where the files have none: of every particle, of each type, or a MercuryDPM .restart file"""
+    density: Annotated[float | None, flag("FLOAT")] = None
+    """masses from the radii: of spheres, or of disks in files of two dimensions"""
+    periodic: Annotated[str | None, flag("AXES")] = None
+    """axes such as x or xy on which the box is periodic, where the files do not say"""
+    contact_columns: Annotated[str | None, flag("FIELD=NAME,...|KEYWORDS")] = None
+    """of contact lists: LAMMPS, as in id1=c_1[1],id2=c_1[2]; LIGGGHTS, keywords of compute pair/gran/local, as in "id force delta" """
 
 
 @dataclass(frozen=True)
@@ -310,12 +316,16 @@ class Import(FileFlags):
     hertz: so do mean mass, contact stiffness and overlap of the contact lists"""
     contact: Annotated[str, flag(choices.CONTACTS[:2], "linear")] = "linear"
     """packings without contact lists: law of the contacts of overlapping grains"""
+    damping: Annotated[float, flag("FLOAT", 0.0)] = 0.0
+    """of the contacts, in the files' units: such runs may lose energy, and their infinite-time average is the late one"""
     n_bands: Annotated[int | None, flag("INT", "32; of packings 9 or 5")] = None
     """wavenumber bands; of packings shells of |q| for each polarization, and one for all other motion"""
     largest: Annotated[float | None, flag("FLOAT", "2 over the mean distance of contacts")] = None
     """packings: longest wavevector |q| of the shells"""
     long_time: Annotated[str, flag(("exact", "late"), "exact")] = "exact"
     """infinite-time average: from the modes of linear undamped rings, or over the later half of the times"""
+    calibrate: Annotated[str | None, flag("FOLDER")] = None
+    """also calibrate a master equation on the transfer, and leave it with its figure in this folder"""
     out: Annotated[str, flag("FOLDER", "results/import")] = "results/import"
     """for config.toml, transfer.nc, figure.png, report.html and run.json"""
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import glob
 import re
 import time
+import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +19,12 @@ from torchchain import checks, plots
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
 from torchchain.cli import choices, outputs, report
-from torchchain.cli.flags import Convert, FileFlags, Import
+from torchchain.cli.calibrate import run_calibrate
+from torchchain.cli.flags import Calibrate, Convert, FileFlags, Import
 from torchchain.energy.bands import check_bands
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.transfer import BandTransfer, Provenance
-from torchchain.frames import ContactUnits, Frames, check_opening, convert, read_frames
+from torchchain.frames import ContactUnits, Frames, FramesWarning, check_opening, convert, read_frames
 from torchchain.frames.order import line_axis
 from torchchain.frames.units import LAWS
 from torchchain.network import Network
@@ -54,10 +57,11 @@ def run_import(flags: Import, arguments: list[str]) -> None:
     files = files_of(flags)
     with outputs.run_folder(flags.out) as out, outputs.told_warnings() as warned:
         log.info("reading %d runs", len(files))
-        with stages("frames"):
-            frames, chains = _chains(flags, files)
-        with stages("transfer"):
-            transfer = _transfer(flags, files, frames, chains)
+        with _each_doubt_once():
+            with stages("frames"):
+                frames, chains = _chains(flags, files)
+            with stages("transfer"):
+                transfer = _transfer(flags, files, frames, chains)
         with stages("figure"):
             figure = _figure(transfer)
         runs = [
@@ -89,11 +93,32 @@ def run_import(flags: Import, arguments: list[str]) -> None:
     print("masses: mean {mass_mean:.5f}, standard deviation {mass_sd:.5f}".format(**transfer.attributes))
     print(starts)
     print(f"{time.time() - began:.1f} s, results in {flags.out}")
+    if flags.calibrate is not None:
+        after = ["calibrate", "--transfer", flags.out, "--out", flags.calibrate]
+        run_calibrate(Calibrate(transfer=flags.out, out=flags.calibrate), after)
+
+
+@contextmanager
+def _each_doubt_once() -> Iterator[None]:
+    """What is doubtful in many runs is told of the first, with the number of the others."""
+    told: dict[str, list[warnings.WarningMessage]] = {}
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield
+    finally:
+        for warning in caught:
+            words = str(warning.message)
+            field = words.split(": ")[1] if issubclass(warning.category, FramesWarning) else words
+            told.setdefault(field, []).append(warning)
+        for first, *others in told.values():
+            more = f" (and {len(others)} more like this)" if others else ""
+            warnings.warn(first.category(f"{first.message}{more}"), stacklevel=2)
 
 
 def _config(flags: Import, files: list[RunFiles]) -> str:
     """The flags as TOML, by which the import can be made again from any folder."""
-    given = {name: value for name, value in vars(flags).items() if value is not None and name != "out"}
+    given = {name: value for name, value in vars(flags).items() if value is not None and name not in ("out", "calibrate")}
     for name in ("reference", "contacts", "masses"):
         place = Path(given.get(name, ""))
         if place.parent != Path() or (name == "masses" and place.is_file()):
@@ -180,6 +205,7 @@ def _check(flags: Import) -> None:
     """What can be said of the flags before anything is read."""
     if flags.n_bands is not None:
         checks.integer("n_bands", flags.n_bands, 1)
+    checks.number("damping", flags.damping, at_least=0.0)
     if flags.largest is not None:
         checks.number("largest", flags.largest, above=0.0)
     checks.choice("contact", flags.contact, LAWS)
@@ -191,6 +217,12 @@ def _check(flags: Import) -> None:
     if flags.axis is not None:
         checks.choice("axis", flags.axis, ("x", "y", "z", "all"))
     law = flags.stiffness if isinstance(_stiffness(flags), str) else None
+    if flags.calibrate is not None:
+        outputs.check_writable(flags.calibrate)
+        if Path(flags.calibrate).absolute() == Path(flags.out).absolute():
+            raise checks.fail("calibrate", "be another folder than out", repr(flags.calibrate))
+    if flags.contacts is None and flags.contact_columns is not None:
+        raise checks.fail("contacts", "be given for contact_columns", "none")
     if flags.contacts is None and (law or flags.units in LAWS):
         name, value = ("stiffness", law) if law else ("units", flags.units)
         raise checks.fail("contacts", f"be given for {name} {value}", "none")
@@ -216,13 +248,31 @@ def _number(word: str) -> float | None:
 
 
 def _options(flags: FileFlags) -> dict[str, Any]:
-    options: dict[str, Any] = {"format": flags.format}
-    if flags.time_step is not None:
-        options["time_step"] = flags.time_step
-    if flags.masses is not None:
-        number = _number(flags.masses)
-        options["masses"] = flags.masses if number is None else checks.number("masses", number, above=0.0)
-    return options
+    """The flags as what :func:`read_frames` takes."""
+    names = ("time_step", "masses", "density", "periodic", "contact_columns")
+    options = {name: getattr(flags, name) for name in names if getattr(flags, name) is not None}
+    masses, columns = options.get("masses"), options.get("contact_columns")
+    if masses is not None and _number(masses) is not None:
+        options["masses"] = checks.number("masses", _number(masses), above=0.0)
+    elif masses is not None and "=" in masses and not Path(masses).is_file():
+        options["masses"] = {_whole(kind): _number(mass) for kind, mass in _pairs("masses", masses).items()}
+    if columns is not None and "=" in columns:
+        options["contact_columns"] = _pairs("contact_columns", columns)
+    return {"format": flags.format, **options}
+
+
+def _pairs(field: str, words: str) -> dict[str, str]:
+    """What is before and after each = in words with commas between."""
+    pairs = [word.split("=") for word in words.split(",")]
+    if any(len(pair) != 2 or not all(pair) for pair in pairs) or len({pair[0] for pair in pairs}) < len(pairs):
+        raise checks.fail(field, "read name=value,name=value, each name once", repr(words))
+    return dict(pairs)
+
+
+def _whole(word: str) -> int:
+    if not word.isdigit():
+        raise checks.fail("masses", "name types by their numbers, as in 1=0.9,2=1.1", repr(word))
+    return int(word)
 
 
 def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Chain] | list[Network]]:
@@ -232,17 +282,21 @@ def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Ch
     if units is not None:
         frames = [each.scaled(units) for each in frames]
     stiffness = _stiffness(flags)
-    if units is not None and not isinstance(stiffness, str):
-        stiffness = stiffness / units.unit("stiffness")
+    damping = flags.damping
+    if units is not None:
+        damping = damping * units.unit("time") / units.unit("mass")
+        stiffness = stiffness if isinstance(stiffness, str) else stiffness / units.unit("stiffness")
     if line_axis(frames[0].name, frames[0].first, flags.axis) is None:
         grains = [
-            each.network(run.reference, stiffness=stiffness, contact=flags.contact)
+            each.network(run.reference, stiffness=stiffness, contact=flags.contact, damping=damping)
             for run, each in zip(files, frames, strict=True)
         ]
         return frames, grains
     chains = []
     for run, each in zip(files, frames, strict=True):
-        chains.append(each.chain(flags.boundary, stiffness, axis=flags.axis, reference=run.reference))
+        chains.append(
+            each.chain(flags.boundary, stiffness, axis=flags.axis, damping=damping, reference=run.reference)
+        )
         check_bands(chains[-1].n_particles, _n_bands(flags, chains[-1]))
     return frames, chains
 

@@ -173,7 +173,8 @@ def _row(record: Mapping[str, Any]) -> dict[str, float]:
     """The numbers that sum a run up."""
     found: dict[str, float] = {}
     for part in ({"seconds": record.get("seconds")}, record.get("realized") or {}, record.get("numbers") or {}):
-        found |= {k: float(v) for k, v in part.items() if isinstance(v, (int, float)) and not isinstance(v, bool)}
+        plain = {name: math.inf if value == "inf" else value for name, value in part.items()}  # JSON has no infinity
+        found |= {k: float(v) for k, v in plain.items() if isinstance(v, (int, float)) and not isinstance(v, bool)}
     return found
 
 

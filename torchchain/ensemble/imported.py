@@ -14,10 +14,62 @@ from torchchain.chain.states import State, Trajectory
 from torchchain.energy.bands import check_bands
 from torchchain.energy.wavenumber import band_energy, long_time_band_energy
 from torchchain.frames import check_energy
+from torchchain.frames.doubts import warn
 from torchchain.network import Network, NetworkTrajectory, PackingBands, packing_band_energy, packing_bands
 
 PURE = 0.99
 """Share of the energy in one band from which a run counts as one that starts in it alone."""
+NOISE, LOSS = 0.01, 0.2
+"""Shares by which the energies of a run may sum up to more than 1, and lose what they began with, before a warning."""
+OUTSIDE = 0.1
+"""Share of the energy that may be in no band, as that of the motion as a whole is, before a warning; 4 / N in short chains."""
+
+
+def as_shares(times: Tensor, energies: Tensor) -> Tensor:
+    """Energies that someone gives, checked to be shares of the energy of each run, and at most 1 together.
+
+    Args:
+        times: (time,).
+        energies: (realization, source, time, receiver).
+
+    Returns:
+        The same; what sums up to more than 1 by the noise of a measurement is scaled to 1.
+
+    Raises:
+        FieldError: for energies in other units or of no size, that grow, or that start in another band.
+
+    Warns:
+        FramesWarning: for negative ones, a loss, sums above 1, and starts that are spread over several bands.
+    """
+    total = energies.sum(-1)
+
+    def at(values: Tensor, *axes: str) -> str:
+        """Where the largest of the values is."""
+        place = torch.unravel_index(values.argmax(), values.shape)
+        return ", ".join(f"{axis} {int(i) + 1}" for axis, i in zip(axes, place, strict=False))
+
+    runs = ("realization", "source", "time")
+    first, most = total[..., 0], total.amax(-1)
+    for wrong, value in ((first < 0.5, first), (most > 1.5, most)):
+        if bool(wrong.any()):
+            place = at(wrong.double(), *runs)
+            rule = "be shares of the energy of each run, 1 in all (divide by their sum at the first time)"
+            raise checks.fail("energies", rule, f"{float(value[wrong][0]):.3g} in all at {place}")
+    own = energies[:, :, 0].mean(0).diagonal() / first.mean(0) if float(times[0]) == 0 else torch.ones(1)
+    if float(own.min()) < PURE:
+        words = f"{float(own.min()):.3g} of the energy of source {int(own.argmin()) + 1} in its own band at time 0"
+        if float(own.min()) < 0.5:
+            raise checks.fail("energies", "start in the band of their source (other starts go into starts=)", words)
+        warn("energies", f"{words}: starts=energies[:, :, 0] counts what is in the others")
+    if float(energies.min()) < -NOISE:
+        warn("energies", f"negative, {float(energies.min()):.3g} at {at(-energies, *runs)}")
+    if float(most.max()) > 1 + NOISE:
+        warn("energies", f"{float(most.max()):.3g} in all at {at(total, *runs)}: scaled to 1")
+    left = total.mean(0) / first.mean(0)[:, None]
+    if float(left.min()) < 1 - LOSS:
+        words = f"down to {float(left.min()):.3g} of those at the first time, at {at(-left, *runs[1:])}"
+        warn("energies", f"{words}: the model will lose that much, and what is left late stays (long_time= says what does)")
+    return energies / total.clamp(min=1)[..., None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +158,7 @@ def gathered(
         except checks.FieldError as error:
             raise checks.FieldError(f"{name}: {error}") from None
         check_energy(name, chain, path)
+        _check_whole(name, chain.n_particles, energy)
         own = (path.times - path.times[0]).detach().cpu().double()
         if not energies:
             times = own
@@ -162,6 +215,16 @@ def _energy(chain: Chain | Network, path: Trajectory, n_bands: int, shells: Pack
         raise checks.fail("chains", "be a network for motion in several directions", "a chain")
     check_bands(chain.n_particles, n_bands)
     return band_energy(chain, path, n_bands)
+
+
+def _check_whole(name: str, n_particles: int, energy: Tensor) -> None:
+    """An error, or a warning, for runs that move as a whole: that energy is in no band."""
+    outside = 1 - float(energy.detach().sum(-1)[..., 0].min())
+    if outside > max(OUTSIDE, 4 / n_particles):
+        words = f"{outside:.3g} of the energy is that of the motion as a whole, in no band (take the mean velocity off)"
+        if outside > 0.5:
+            raise checks.fail(f"{name}, frame 1: velocities", "be those of a wave", words)
+        warn(f"{name}, frame 1: velocities", words)
 
 
 def _check_same(name: str, own: Tensor, times: Tensor, n_particles: int, kinds: list[tuple[Tensor, Tensor]]) -> None:

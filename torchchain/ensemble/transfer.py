@@ -24,7 +24,7 @@ from torchchain.chain.states import Trajectory
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.block_means import decoded, encoded, rounded
 from torchchain.ensemble.checkpoint import Checkpoint
-from torchchain.ensemble.imported import gathered
+from torchchain.ensemble.imported import as_shares, gathered
 from torchchain.ensemble.labels import ordered_error, scene_attributes, time_coordinates
 from torchchain.ensemble.layout import BLOCKS
 from torchchain.ensemble.mixed_starts import fit_transfer
@@ -167,8 +167,11 @@ class BandTransfer(Printed):
 
     @property
     def is_ordered(self) -> bool:
-        """Whether every realization is the same chain, so that there is no error of an ensemble."""
-        return self.scene is not None and self.scene.is_ordered
+        """Whether no energy leaves its band: every realization is the same chain of equal masses."""
+        if self.scene is not None:
+            return self.scene.is_ordered
+        still = torch.eye(self.n_bands, dtype=self.mean.dtype)[:, None]
+        return float(self.times[-1]) > 0 and bool((self.mean == still).all())
 
     def _rows(self) -> dict[str, str]:
         assert self.provenance is not None
@@ -382,8 +385,12 @@ class BandTransfer(Printed):
         2
 
         Raises:
-            FieldError, FieldTypeError: for times, shapes or numbers that are none of a transfer, and for starts that do
-                not tell the bands apart.
+            FieldError, FieldTypeError: for times, shapes or numbers that are none of a transfer, energies that are no
+                shares or start in another band than their source, and for starts that do not tell the bands apart.
+
+        Warns:
+            FramesWarning: for energies that are negative, sum up to more than 1 (scaled to 1), lose what they began
+                with, or start in several bands without ``starts``.
         """
         times, energies = checks.times("times", times), checks.real_tensor("energies", energies)
         square = starts is not None or energies.ndim != 4 or energies.shape[1] == energies.shape[3]
@@ -394,12 +401,15 @@ class BandTransfer(Printed):
         if not len(energies):
             raise checks.fail("energies", "hold at least one realization", "none")
         times, energies = times.detach().cpu().double(), energies.detach().cpu().double()
+        if starts is None:
+            energies = as_shares(times, energies)
         provenance = _imported(provenance, times, energies)
         if starts is not None:
             starts = checks.real_tensor("starts", starts).detach().cpu().double()
             expected = (*energies.shape[:2], energies.shape[3])
             if tuple(starts.shape) != expected:
                 raise checks.fail("starts", f"have shape {expected}", f"shape {tuple(starts.shape)}")
+            checks.first_bad("starts", "not be negative", starts, starts < 0, "realization")
             late = None if long_time is None else checks.real_tensor("long_time", long_time).cpu().double()
             per_run = late is not None and late.ndim == 3
             if late is not None and per_run:
@@ -648,10 +658,10 @@ def band_transfer(
     )  # fmt: skip
     with single_thread(), stages("statistics"):
         found = _from_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None)
-        return found if exact or not long_time else _with_late_average(found)
+        return found if exact or not long_time else with_late_average(found)
 
 
-def _with_late_average(transfer: BandTransfer) -> BandTransfer:
+def with_late_average(transfer: BandTransfer) -> BandTransfer:
     """The long-time average over the later half of the times, its error that of the block means and of not having settled."""
     average, unsettled = _late_average(transfer.times, transfer.mean[None])
     blocks, _ = _late_average(transfer.times, transfer.block_mean)

@@ -39,7 +39,7 @@ def chain(
     if abs(mean - 1) > max(FAR, 4 * spread):
         warn(
             f"{here(name, frame)}: masses",
-            f"their mean is {mean:.4g}, not 1: times are in other units than the library's (frames.scaled gives those)",
+            f"their mean is {mean:.4g}, not 1: times are in other units than the library's (frames.scaled, or import --units mass, gives those)",
         )
     checks.choice("boundary", boundary, ("periodic", "fixed"))
     periodic = frame.box is not None and frame.box.periodic[AXES.index(line)]

@@ -9,6 +9,7 @@ import warnings
 import torch
 from torch import Tensor
 
+from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
 from torchchain.frames.record import AXES, Frame, FramesWarning
@@ -102,7 +103,8 @@ def check_across(name: str, frame: Frame, axis: str) -> None:
 
 
 def check_energy(name: str, chain: Chain | Network, path: Trajectory) -> None:
-    """A warning for a motion that the chain, or network, does not make: energy that drifts without damping.
+    """A warning for a motion that the chain, or network, does not make: energy that drifts without damping; an error for
+    one that more than doubles its energy, which no chain does by itself.
 
     Args:
         name: of the file or run, for the warning.
@@ -126,10 +128,14 @@ def check_energy(name: str, chain: Chain | Network, path: Trajectory) -> None:
     change = torch.where(start > 0, total / start - 1, 0.0)
     worst = int(change.abs().argmax())
     run, k = divmod(worst, len(path.times))
+    field, words = f"{name}, frame {k + 1}: energy", f"{1 + float(change[run, k]):.4g} of that of frame 1"
+    if float(change[run, k]) > 1:
+        reasons = f"a kick after it, or another stiffness, or units, than the {kind}'s"
+        raise checks.fail(field, "be that of the first frame", f"{words}: {reasons}")
     if abs(float(change[run, k])) > DRIFT:
         warn(
-            f"{name}, frame {k + 1}: energy",
-            f"{1 + float(change[run, k]):.4g} of that of frame 1, for a {kind} without damping: damping or too long a time step there, or another stiffness than the {kind}'s",
+            field,
+            f"{words}, for a {kind} without damping: damping or too long a time step there, or another stiffness than the {kind}'s",
         )
 
 

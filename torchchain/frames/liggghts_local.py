@@ -16,7 +16,7 @@ from torchchain.frames.registry import Entry, Format, Raw
 # The order in which the compute writes, whatever the order of its keywords, and the values of each.
 WIDTHS = {
     "pos": 6, "vel": 6, "id": 3, "force": 3, "force_normal": 3, "force_tangential": 3, "torque": 3, "torque_normal": 3,
-    "torque_tangential": 3, "history": None, "contactArea": 1, "delta": 1, "heatFlux": 1, "contactPoint": 3, "ms_id": 2,
+    "torque_tangential": 3, "history": None, "contactArea": 1, "delta": 1, "contactPoint": 3, "ms_id": 2, "heatFlux": 1,
 }  # fmt: skip
 
 

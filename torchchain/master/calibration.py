@@ -10,7 +10,7 @@ import torch
 
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
-from torchchain.ensemble.transfer import BandTransfer
+from torchchain.ensemble.transfer import BandTransfer, with_late_average
 from torchchain.master.certified import certified
 from torchchain.master.compact import CompactModel
 from torchchain.master.equation import MasterEquation
@@ -113,7 +113,8 @@ def calibrate(
             procedures L and NL of Section 3.5 on the times in the window; "adam": Q from all times, starting from L;
             "projection": the model "memory" from all times; "logistic": the model "compact" from all times. None for the one that fits the model best.
         model: "paper" (basis energy Psi of Eq. 47), "exact_psi", "basis_matrix", "swing_in", "compact", "memory" (all but the
-            first need the long-time average) or a registered one; None: the richest that the method fits.
+            first need the long-time average) or a registered one; None: the richest that the method fits. Where the
+            transfer has no long-time average and no model is named, that of the later half of its times serves, with a warning.
         window: first and last time of the fits at short times; None for 0.5 to 2, "nonlinear" 0.5 to 4.5.
         bootstrap: number of ensembles drawn again for the error bars, 0 for none; None for 20, or none with methods
             that would take long ("adam", "nonlinear") and with fewer than 4 blocks of realizations.
@@ -139,6 +140,8 @@ def calibrate(
         ((8, 8), True)
     """
     checks.instance("transfer", transfer, BandTransfer)
+    if model is None and transfer.long_time is None and not transfer.damping and not transfer.is_ordered:
+        transfer = _settled(transfer)
     asked = recipe(transfer, method, model, window, **settings)
     replicates = _replicates(bootstrap, asked.fit, transfer)
     if transfer.is_ordered:
@@ -161,6 +164,20 @@ def calibrate(
         if replicates:
             errors = draw_again(transfer, asked, free, replicates, shown.update, fitted)
     return MasterEquation(fitted, _record(transfer, asked, report), errors)
+
+
+def _settled(transfer: BandTransfer) -> BandTransfer:
+    """The transfer with the long-time average that its own later half shows, so that no model is left out for want of it."""
+    found = with_late_average(transfer)
+    assert found.long_time_stderr is not None
+    error = float(found.long_time_stderr.max())
+    warnings.warn(
+        f"transfer holds no long-time average: taken over the later half of its times, t >= {float(found.times[-1]) / 2:g}, "
+        f"with a standard error up to {error:.2g}",
+        FitWarning,
+        stacklevel=3,
+    )
+    return found
 
 
 def _record(transfer: BandTransfer, asked: Recipe, report: Report) -> Calibration:
