@@ -4,6 +4,8 @@ import pytest
 import torch
 
 import torchchain as tc
+from torchchain import cli
+from torchchain.cli import outputs
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -33,3 +35,22 @@ def small_scene():
 def small_transfer(small_scene):
     """The transfer between its bands, by normal modes."""
     return tc.band_transfer(small_scene, "modes")
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the command in a folder of its own; returns the exit status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments):
+        capsys.readouterr()
+        status = cli.main([str(argument) for argument in arguments])
+        return status, *capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture
+def no_drawing(monkeypatch):
+    """Figures are made but not rendered, which takes longer than all the rest of a small run."""
+    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))

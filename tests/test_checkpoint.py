@@ -36,11 +36,6 @@ EVERY = ["--checkpoint-every", "0"]  # after every chunk of two chains
 pytestmark = pytest.mark.filterwarnings("ignore:prediction to time")
 
 
-@pytest.fixture
-def no_drawing(monkeypatch):
-    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
-
-
 def data_of(folder):
     """All numbers that a run left, as bytes by name."""
     found = {}

@@ -19,25 +19,6 @@ from torchchain.modes.spectrum import DecompositionError
 SMALL = "--n-particles 32 --n-bands 4 --realizations 4 --times.stop 5 --seed 5 --method modes".split()
 
 
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the command in a folder of its own; returns the exit status, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments):
-        capsys.readouterr()
-        status = cli.main([str(argument) for argument in arguments])
-        return status, *capsys.readouterr()
-
-    return command
-
-
-@pytest.fixture
-def no_drawing(monkeypatch):
-    """Figures are made but not rendered, which takes longer than all the rest of a small run."""
-    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
-
-
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):
     """The folder of a small calibration."""

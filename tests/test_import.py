@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import torchchain as tc
-from torchchain import cli
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.cli import choices, flags, outputs
 from torchchain.frames import FORMATS, FramesWarning
@@ -21,25 +20,6 @@ RUNS, REFERENCE = str(DUMPS / "linear-*.dump.gz"), "{group}.reference.dump"
 GOOD = ["--reference", REFERENCE, "--n-bands", "3"]
 N, B = 32, 4
 TIMES = torch.arange(0.0, 12.0, dtype=torch.float64)
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the command in a folder of its own; returns the exit status, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments):
-        capsys.readouterr()
-        status = cli.main([str(argument) for argument in arguments])
-        return status, *capsys.readouterr()
-
-    return command
-
-
-@pytest.fixture
-def no_drawing(monkeypatch):
-    """Figures are made but not rendered, which takes longer than all the rest of a small run."""
-    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
 
 
 def scene(**more):
@@ -248,7 +228,189 @@ def test_energy_that_drifts_is_named():
     assert [str(each.message).partition(",")[0] for each in caught] == [names[-1]]
 
 
+def pure(generator, realizations=4, late=5):
+    """Energies of runs that start in one band each, (realization, source, time, receiver)."""
+    left = torch.exp(-torch.arange(late + 1, dtype=torch.float64))[:, None]
+    spread = torch.softmax(torch.randn(realizations, B, late + 1, B, generator=generator, dtype=torch.float64), -1)
+    return left * torch.eye(B, dtype=torch.float64)[:, None] + (1 - left) * spread
+
+
+def scaled(factor, *place):
+    def change(energies):
+        energies[place] *= factor
+        return energies
+
+    return change
+
+
+NO_SHARES = {
+    "joules": (scaled(1e-9), r"be shares of the energy of each run, 1 in all .* got 1e-09 in all at realization 1, source 1"),
+    "one run in other units": (scaled(2.0, 2, 1), "got 2 in all at realization 3, source 2"),
+    "a run without energy": (scaled(0.0, 2, 1), "got 0 in all at realization 3, source 2"),
+    "a spike": (scaled(3.0, 0, 3, 4), "got 3 in all at realization 1, source 4"),
+    "sources and receivers in other orders": (lambda e: e.flip(1), "start in the band of their source .* got 0 of the energy of source 1"),
+    "negative": (lambda e: -e, "be shares of the energy of each run"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", NO_SHARES)
+def test_energies_that_are_no_shares(case):
+    change, words = NO_SHARES[case]
+    energies = pure(torch.Generator().manual_seed(1))
+    tc.BandTransfer.from_energies(torch.arange(6.0), energies)
+    with pytest.raises(FieldError, match=f"energies must .*{words}"):
+        tc.BandTransfer.from_energies(torch.arange(6.0), change(energies))
+
+
+def told(call):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = call()
+    return found, [str(each.message) for each in caught]
+
+
+def test_doubtful_energies_are_named():
+    energies, times = pure(torch.Generator().manual_seed(1)), torch.arange(6.0)
+
+    def build(changed, **more):
+        return told(lambda: tc.BandTransfer.from_energies(times, changed, **more))
+
+    assert build(energies)[1] == []
+    noisy = energies.clone()
+    noisy[1, 2, 3] *= 1.2
+    found, words = build(noisy)
+    assert words == ["energies: 1.2 in all at realization 2, source 3, time 4: scaled to 1"]
+    assert float(found.mean.sum(-1).max()) <= 1 + 1e-15
+    negative = energies.clone()
+    negative[0, 0, 5] = torch.tensor([0.9, -0.3, 0.2, 0.2])
+    assert build(negative)[1] == ["energies: negative, -0.3 at realization 1, source 1, time 6"]
+    lost = energies * torch.exp(-0.2 * times)[:, None]
+    assert "energies: down to 0.368 of those at the first time, at source" in build(lost)[1][0]
+    smeared = 0.9 * energies + 0.1 * energies.flip(1)
+    assert "energies: 0.9 of the energy of source 1 in its own band at time 0: starts=" in build(smeared)[1][0]
+    undone, words = build(smeared, starts=smeared[:, :, 0])
+    assert words == []
+    assert float((undone.mean[:, 0] - torch.eye(B)).abs().max()) < 1e-12
+    with pytest.raises(FieldError, match="starts must not be negative by more than a tenth, got -"):
+        tc.BandTransfer.from_energies(times, energies, starts=-energies[:, :, 0])
+
+
+def test_runs_that_move_as_a_whole():
+    ring = scene().chain(range(5))
+    start = scene().state(ring)
+    for speed, known in ((1e-4, None), (2e-3, "warning"), (0.1, "error")):
+        state = tc.State(start.displacement, start.velocity + speed)
+        path = moved(ring, state)
+        if known == "error":
+            with pytest.raises(FieldError, match=r"run 1, frame 1: velocities must be those of a wave, got 0\.9"):
+                tc.BandTransfer.from_trajectories(ring, path, B)
+            continue
+        _, words = told(lambda path=path: tc.BandTransfer.from_trajectories(ring, path, B))
+        assert len(words) == (known == "warning")
+        assert all("run 1, frame 1: velocities: 0." in line and "motion as a whole" in line for line in words)
+
+
+def test_energies_that_stay_where_they_are():
+    """Of equal masses, by anyone: all of it is basis energy."""
+    energies = torch.eye(B, dtype=torch.float64).expand(5, 6, B, B).transpose(1, 2)
+    master = tc.calibrate(tc.BandTransfer.from_energies(torch.arange(6.0), energies))
+    assert float(master.rates.detach().abs().max()) == 0
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["scene", "data"])
+def test_without_a_long_time_average_the_late_part_serves(own, small_transfer):
+    """The model is not the paper's for want of it."""
+    bare = dataclasses.replace(small_transfer, long_time=None, long_time_stderr=None, block_long_time=None)
+    bare = bare if own else dataclasses.replace(bare, scene=None, provenance=tc.Provenance("imported", "a notebook"))
+    with pytest.warns(tc.FitWarning, match=r"no long-time average: taken over the later half of its times, t >= 2\.5"):
+        master = tc.calibrate(bare, bootstrap=0)
+    assert master.calibration.model not in ("paper", "exact_psi")
+    late = small_transfer.times >= 2.5
+    named = "basis_matrix"
+    with pytest.warns(tc.FitWarning, match="standard error up to"):
+        linear = tc.calibrate(bare, "linear", bootstrap=0)
+    assert linear.calibration.model == named
+    assert float((linear.model.basis - bare.mean[:, late].mean(1)).abs().max()) < 1e-9
+    with pytest.raises(FieldError, match="must hold the long-time average"):
+        tc.calibrate(bare, model=named)
+
+
 # The commands
+
+
+def test_a_folder_of_dumps_to_a_model_in_one_command(run, tmp_path):
+    status, output, errors = run("import", RUNS, *GOOD, "--out", "data", "--calibrate", "model")
+    assert (status, errors) == (0, "")
+    assert "memory, fitted by projection" in output
+    assert {"model.safetensors", "figure.png", "transfer.nc"} <= set(os.listdir("model"))
+    opened = tc.open("model")
+    assert torch.equal(opened.transfer.mean, tc.open("data").transfer.mean)
+    assert opened.master.n_bands == 3
+    for folder in ("data", "model"):
+        assert run("rerun", folder)[0] == 0
+    for words in (("--out", "same", "--calibrate", "same"), ("--calibrate", ""), ("--calibrate", DUMPS / "linear.kinetic.txt")):  # fmt: skip
+        status, output, errors = run("import", RUNS, *GOOD, *words)
+        assert (status, output, errors.count("\n")) == (2, "", 1)
+    assert sorted(os.listdir(tmp_path)) == ["data", "model"]
+
+
+def written(columns, path, text=""):
+    """A stored run with other columns: type in place of mass, and radius."""
+    for frame in tc.read_frames(DUMPS / "linear-1-1.dump.gz"):
+        text += f"ITEM: TIME\n{frame.time:.17g}\nITEM: TIMESTEP\n{frame.step}\nITEM: NUMBER OF ATOMS\n12\n"
+        text += f"ITEM: BOX BOUNDS pp pp pp\n0 12\n-2 2\n-2 2\nITEM: ATOMS {columns}\n"
+        for i in range(12):
+            known = {"id": i + 1, "type": 1 + i % 2, "radius": 0.5, "xu": frame.positions[i, 0], "vx": frame.velocities[i, 0]}
+            text += " ".join(f"{float(known[name]):.17g}" for name in columns.split()) + "\n"
+    path.write_text(text)
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize("kind", ["type", "radius"])
+def test_masses_by_flags(kind, run, tmp_path):
+    """A dict of types, or a density; each of them one line where it is wrong."""
+    written(f"id {kind} xu vx", tmp_path / "run.dump")
+    good, bad = {
+        "type": (["--masses", "1=0.9,2=1.1"], ["1=0.9", "1=0.9,2", "1=0.9,1=1.1", "one=1,2=1", "1=0.9,2=-1", "1=0.9,2=heavy"]),
+        "radius": (["--density", "2"], ["-1", "0"]),
+    }[kind]  # fmt: skip
+    assert run("convert", "run.dump", "run.nc", *good)[0] == 0
+    masses = tc.read_frames("run.nc").masses
+    expected = torch.tensor([0.9, 1.1]).repeat(6) if kind == "type" else 2 * 4 / 3 * torch.pi * torch.full((12,), 0.125)
+    assert float((masses - expected).abs().max()) < 1e-6
+    for word in bad:
+        status, output, errors = run("convert", "run.dump", "bad.nc", good[0], word)
+        assert (status, output, errors.count("\n")) == (2, "", 1), word
+    assert sorted(os.listdir(tmp_path)) == ["run.dump", "run.nc"]
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_doubts_that_many_runs_share_are_told_once(run, tmp_path):
+    """Damped runs of a chain that is said not to be, until the damping is named."""
+    ring = scene(realizations=2).chain(range(2))
+    damped = dataclasses.replace(ring, damping=0.05)
+    chains, paths = singly(ring, tc.evolve(damped, scene().state(ring), TIMES, method="damped"))
+    rest = torch.arange(N) + 0.5
+    for i, (chain, path) in enumerate(zip(chains, paths, strict=True)):
+        for name, moves in ((f"run-{i}.dump", range(len(TIMES))), (f"run-{i}.rest.dump", [None])):
+            text = ""
+            for k in moves:
+                x, v = (rest, 0 * rest) if k is None else (rest + path.displacement[k], path.velocity[k])
+                text += f"ITEM: TIME\n{k or 0}\nITEM: TIMESTEP\n{k or 0}\nITEM: NUMBER OF ATOMS\n{N}\n"
+                text += f"ITEM: BOX BOUNDS pp pp pp\n0 {N}\n-2 2\n-2 2\nITEM: ATOMS id mass xu vx\n"
+                rows = zip(range(1, N + 1), chain.masses.tolist(), x.tolist(), v.tolist(), strict=True)
+                text += "".join(f"{n} {m:.17g} {a:.17g} {b:.17g}\n" for n, m, a, b in rows)
+            (tmp_path / name).write_text(text)
+    command = ["import", "run-*.dump", "--reference", "{stem}.rest.dump", "--n-bands", B]
+    with pytest.warns(FramesWarning) as caught:
+        assert run(*command, "--out", "plain")[0] == 0
+    (words,) = (str(each.message) for each in caught)
+    assert words.startswith("run-0.dump, frame 12: energy: 0.")
+    assert words.endswith("(and 7 more like this)")
+    status, _, errors = run(*command, "--damping", "0.05", "--out", "damped")
+    assert (status, errors) == (0, "")
+    late = tc.open("damped").transfer
+    assert float((late.long_time - late.mean[:, TIMES >= 5.5].mean(1)).abs().max()) < 1e-12
 
 
 def test_import_calibrate_predict(run, tmp_path):
@@ -385,6 +547,10 @@ MISTAKES = [
     ("import RUN --n-bands 3 --axis y", "linear-1-1.dump.gz, frame 1: y must be in the file"),
     ("import RUN --time-step 1", "time_step must be left out"),
     ("import RUN --masses 1", "masses must be left out"),
+    ("import RUN --damping -1", "damping must be at least 0"),
+    ("import RUN --periodic q", "periodic must be axes such as 'x' or 'xy'"),
+    ("import RUN --contact-columns id", "contacts must be given for contact_columns"),
+    ("import RUN --contacts RUN --contact-columns id1=c_1[1],id2", "contact_columns must read name=value"),
     ("import RUN --format xyzz", "format must be one of lammps, mercury, xyz, netcdf"),
     ("import KINETIC", "linear.kinetic.txt, frame 1: header must give"),
     ("convert", "run must be a file"),

@@ -409,7 +409,7 @@ class BandTransfer(Printed):
             expected = (*energies.shape[:2], energies.shape[3])
             if tuple(starts.shape) != expected:
                 raise checks.fail("starts", f"have shape {expected}", f"shape {tuple(starts.shape)}")
-            checks.first_bad("starts", "not be negative", starts, starts < 0, "realization")
+            checks.first_bad("starts", "not be negative by more than a tenth", starts, starts < -0.1, "realization")
             late = None if long_time is None else checks.real_tensor("long_time", long_time).cpu().double()
             per_run = late is not None and late.ndim == 3
             if late is not None and per_run:
