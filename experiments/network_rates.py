@@ -22,7 +22,7 @@ from stencil_rates import in_turn
 import torchchain as tc
 from torchchain import network as nw
 from torchchain.chain import State
-from torchchain.network import chebyshev
+from torchchain.network import chebyshev, layouts
 
 WAYS = ("scipy CSR", "torch CSR", "one field", "two fields")
 
@@ -78,7 +78,7 @@ def ways(network: nw.Network, config: Config, products: int) -> dict[str, Callab
         )  # fmt: skip
     vector = torch.from_numpy(x)
     top = float(chebyshev.highest_frequency(network))
-    layout = chebyshev.layout_of(network)
+    layout = layouts.layout_of(network)
     run = layout.bind(0, top)
     pool = ThreadPoolExecutor(config.threads)
     cuts = [layout.parts * i // config.threads for i in range(config.threads + 1)]

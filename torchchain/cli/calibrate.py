@@ -21,7 +21,7 @@ from torchchain.cli.runs import Run, config_of, merged_tables, running, scene_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.scene import describe
 from torchchain.ensemble.statistics import statistical_distance, total_variation
-from torchchain.ensemble.transfer import BandTransfer, band_transfer
+from torchchain.ensemble.transfer import BandTransfer, band_transfer, measured_observables
 from torchchain.master import Calibration, MasterEquation, calibrate
 from torchchain.master.calibration import recipe
 from torchchain.master.ladder import methods
@@ -56,7 +56,7 @@ def run_calibrate(
         found = run.measured(band_transfer, scene)
         if found is not None:
             assert found.scene is not None, "of a simulation"
-            ensemble = replace(found.scene, observables=("band_energy", "long_time_band_energy"))
+            ensemble = replace(found.scene, observables=measured_observables(found.scene))
             forecast = planning.forecast(ensemble, found.attributes, run.spent, float(found.stderr.max()))
             _leave(run, found, settings, forecast, run.how(ensemble, found.attributes), shown)
 

@@ -649,16 +649,21 @@ def band_transfer(
         with stages("theory"):
             return _from_theory(scene, long_time and scene.damping == 0)
     long_time = long_time and scene.damping == 0
-    exact = scene.lattice is None or scene.n_particles * scene.n_components <= MOST_UNKNOWNS
-    late = ("long_time_band_energy",) if long_time and exact else ()
+    observables = measured_observables(scene, long_time)
     ensemble = ensemble_moments(
-        replace(scene, observables=("band_energy", *late)), method,
+        replace(scene, observables=observables), method,
         min(BLOCKS, scene.distinct_realizations // scene.sample_size), device=device, memory_budget=memory_budget,
         progress=progress, stages=stages, options=options, checkpoint=checkpoint, ranks=ranks,
     )  # fmt: skip
     with single_thread(), stages("statistics"):
         found = _from_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None)
-        return found if exact or not long_time else with_late_average(found)
+        return with_late_average(found) if long_time and len(observables) == 1 else found
+
+
+def measured_observables(scene: Scene, long_time: bool = True) -> tuple[str, ...]:
+    """What is measured on every realization of a band transfer: of large lattices no long-time average, which takes all modes."""
+    exact = scene.lattice is None or scene.n_particles * scene.n_components <= MOST_UNKNOWNS
+    return ("band_energy", *(("long_time_band_energy",) if long_time and exact and scene.damping == 0 else ()))
 
 
 def with_late_average(transfer: BandTransfer) -> BandTransfer:

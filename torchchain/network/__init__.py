@@ -6,7 +6,6 @@ from torchchain.network.bands import (
     band_energy,
     band_waves,
     long_time_band_energy,
-    plane_wave,
     shell_bands,
 )
 from torchchain.network.disorder import diluted, disordered, displaced, mixture
@@ -37,6 +36,7 @@ from torchchain.network.modes import (
 from torchchain.network.networks import Network
 from torchchain.network.packing_bands import PackingBands, packing_band_energy, packing_bands
 from torchchain.network.packings import Packing, packing, rattlers, subnetwork, without_rattlers
+from torchchain.network.plane_waves import plane_wave
 from torchchain.network.spectra import (
     Spectrum,
     born_rate,

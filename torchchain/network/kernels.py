@@ -9,224 +9,18 @@ neighbors of a row of particles are rows, the loops run along them, and nothing 
 
 Importing this file imports Numba.
 """
-# mypy: allow-untyped-defs
+# mypy: allow-untyped-defs, disable-error-code="call-arg"
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numba import njit
+from numba.cpython.unsafe.tuple import tuple_setitem
 
 _kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 _U = np.uint64
-
-
-@_kernel
-def _gathered_1_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
-    """One step for one component of one field; ``ends`` are offsets into ``now``."""
-    for p in range(_U(begin), _U(end)):
-        at = _U(1) * p
-        x0 = now[at]
-        fx0 = 0.0
-        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
-            q = _U(ends[s])
-            k = stiff[s]
-            fx0 += k * (now[q] - x0)
-        w = weight[p]
-        if first:
-            old[at] = x0 + 0.5 * w * fx0
-        else:
-            old[at] = w * fx0 + (2.0 * x0 - old[at])
-
-
-@_kernel
-def _gathered_1_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
-    """One step for one component of two fields; ``ends`` are offsets into ``now``."""
-    for p in range(_U(begin), _U(end)):
-        at = _U(2) * p
-        x0, x1 = now[at], now[at + _U(1)]
-        fx0, fx1 = 0.0, 0.0
-        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
-            q = _U(ends[s])
-            k = stiff[s]
-            fx0 += k * (now[q] - x0)
-            fx1 += k * (now[q + _U(1)] - x1)
-        w = weight[p]
-        if first:
-            old[at] = x0 + 0.5 * w * fx0
-            old[at + _U(1)] = x1 + 0.5 * w * fx1
-        else:
-            old[at] = w * fx0 + (2.0 * x0 - old[at])
-            old[at + _U(1)] = w * fx1 + (2.0 * x1 - old[at + _U(1)])
-
-
-@_kernel
-def _gathered_2_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
-    """One step for two components of one field; ``ends`` are offsets into ``now``."""
-    prestressed, signed = len(across) > 0, len(stiff) > 0
-    for p in range(_U(begin), _U(end)):
-        at = _U(2) * p
-        x0, y0 = now[at], now[at + _U(1)]
-        fx0, fy0 = 0.0, 0.0
-        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
-            q = _U(ends[s])
-            nx, ny = directions[_U(2) * s], directions[_U(2) * s + _U(1)]
-            dx0 = now[q] - x0
-            dy0 = now[q + _U(1)] - y0
-            pull0 = nx * dx0 + ny * dy0
-            if signed:
-                pull0 *= stiff[s]
-            fx0 += nx * pull0
-            fy0 += ny * pull0
-            if prestressed:
-                t = across[s]
-                fx0 += t * dx0
-                fy0 += t * dy0
-        w = weight[p]
-        if first:
-            old[at] = x0 + 0.5 * w * fx0
-            old[at + _U(1)] = y0 + 0.5 * w * fy0
-        else:
-            old[at] = w * fx0 + (2.0 * x0 - old[at])
-            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
-
-
-@_kernel
-def _gathered_2_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
-    """One step for two components of two fields; ``ends`` are offsets into ``now``."""
-    prestressed, signed = len(across) > 0, len(stiff) > 0
-    for p in range(_U(begin), _U(end)):
-        at = _U(4) * p
-        x0, y0, x1, y1 = now[at], now[at + _U(1)], now[at + _U(2)], now[at + _U(3)]
-        fx0, fy0, fx1, fy1 = 0.0, 0.0, 0.0, 0.0
-        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
-            q = _U(ends[s])
-            nx, ny = directions[_U(2) * s], directions[_U(2) * s + _U(1)]
-            dx0 = now[q] - x0
-            dy0 = now[q + _U(1)] - y0
-            pull0 = nx * dx0 + ny * dy0
-            dx1 = now[q + _U(2)] - x1
-            dy1 = now[q + _U(3)] - y1
-            pull1 = nx * dx1 + ny * dy1
-            if signed:
-                pull0 *= stiff[s]
-                pull1 *= stiff[s]
-            fx0 += nx * pull0
-            fy0 += ny * pull0
-            fx1 += nx * pull1
-            fy1 += ny * pull1
-            if prestressed:
-                t = across[s]
-                fx0 += t * dx0
-                fy0 += t * dy0
-                fx1 += t * dx1
-                fy1 += t * dy1
-        w = weight[p]
-        if first:
-            old[at] = x0 + 0.5 * w * fx0
-            old[at + _U(1)] = y0 + 0.5 * w * fy0
-            old[at + _U(2)] = x1 + 0.5 * w * fx1
-            old[at + _U(3)] = y1 + 0.5 * w * fy1
-        else:
-            old[at] = w * fx0 + (2.0 * x0 - old[at])
-            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
-            old[at + _U(2)] = w * fx1 + (2.0 * x1 - old[at + _U(2)])
-            old[at + _U(3)] = w * fy1 + (2.0 * y1 - old[at + _U(3)])
-
-
-@_kernel
-def _gathered_3_1(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
-    """One step for three components of one field; ``ends`` are offsets into ``now``."""
-    prestressed, signed = len(across) > 0, len(stiff) > 0
-    for p in range(_U(begin), _U(end)):
-        at = _U(3) * p
-        x0, y0, z0 = now[at], now[at + _U(1)], now[at + _U(2)]
-        fx0, fy0, fz0 = 0.0, 0.0, 0.0
-        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
-            q = _U(ends[s])
-            nx, ny, nz = directions[_U(3) * s], directions[_U(3) * s + _U(1)], directions[_U(3) * s + _U(2)]
-            dx0 = now[q] - x0
-            dy0 = now[q + _U(1)] - y0
-            dz0 = now[q + _U(2)] - z0
-            pull0 = nx * dx0 + ny * dy0 + nz * dz0
-            if signed:
-                pull0 *= stiff[s]
-            fx0 += nx * pull0
-            fy0 += ny * pull0
-            fz0 += nz * pull0
-            if prestressed:
-                t = across[s]
-                fx0 += t * dx0
-                fy0 += t * dy0
-                fz0 += t * dz0
-        w = weight[p]
-        if first:
-            old[at] = x0 + 0.5 * w * fx0
-            old[at + _U(1)] = y0 + 0.5 * w * fy0
-            old[at + _U(2)] = z0 + 0.5 * w * fz0
-        else:
-            old[at] = w * fx0 + (2.0 * x0 - old[at])
-            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
-            old[at + _U(2)] = w * fz0 + (2.0 * z0 - old[at + _U(2)])
-
-
-@_kernel
-def _gathered_3_2(begin, end, old, now, weight, starts, ends, stiff, directions, across, first):
-    """One step for three components of two fields; ``ends`` are offsets into ``now``."""
-    prestressed, signed = len(across) > 0, len(stiff) > 0
-    for p in range(_U(begin), _U(end)):
-        at = _U(6) * p
-        x0, y0, z0, x1, y1, z1 = (
-            now[at],
-            now[at + _U(1)],
-            now[at + _U(2)],
-            now[at + _U(3)],
-            now[at + _U(4)],
-            now[at + _U(5)],
-        )
-        fx0, fy0, fz0, fx1, fy1, fz1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
-            q = _U(ends[s])
-            nx, ny, nz = directions[_U(3) * s], directions[_U(3) * s + _U(1)], directions[_U(3) * s + _U(2)]
-            dx0 = now[q] - x0
-            dy0 = now[q + _U(1)] - y0
-            dz0 = now[q + _U(2)] - z0
-            pull0 = nx * dx0 + ny * dy0 + nz * dz0
-            dx1 = now[q + _U(3)] - x1
-            dy1 = now[q + _U(4)] - y1
-            dz1 = now[q + _U(5)] - z1
-            pull1 = nx * dx1 + ny * dy1 + nz * dz1
-            if signed:
-                pull0 *= stiff[s]
-                pull1 *= stiff[s]
-            fx0 += nx * pull0
-            fy0 += ny * pull0
-            fz0 += nz * pull0
-            fx1 += nx * pull1
-            fy1 += ny * pull1
-            fz1 += nz * pull1
-            if prestressed:
-                t = across[s]
-                fx0 += t * dx0
-                fy0 += t * dy0
-                fz0 += t * dz0
-                fx1 += t * dx1
-                fy1 += t * dy1
-                fz1 += t * dz1
-        w = weight[p]
-        if first:
-            old[at] = x0 + 0.5 * w * fx0
-            old[at + _U(1)] = y0 + 0.5 * w * fy0
-            old[at + _U(2)] = z0 + 0.5 * w * fz0
-            old[at + _U(3)] = x1 + 0.5 * w * fx1
-            old[at + _U(4)] = y1 + 0.5 * w * fy1
-            old[at + _U(5)] = z1 + 0.5 * w * fz1
-        else:
-            old[at] = w * fx0 + (2.0 * x0 - old[at])
-            old[at + _U(1)] = w * fy0 + (2.0 * y0 - old[at + _U(1)])
-            old[at + _U(2)] = w * fz0 + (2.0 * z0 - old[at + _U(2)])
-            old[at + _U(3)] = w * fx1 + (2.0 * x1 - old[at + _U(3)])
-            old[at + _U(4)] = w * fy1 + (2.0 * y1 - old[at + _U(4)])
-            old[at + _U(5)] = w * fz1 + (2.0 * z1 - old[at + _U(5)])
 
 
 @_kernel
@@ -239,53 +33,76 @@ def _terms(k, last, table):
     return count, terms
 
 
-@_kernel
-def gathered(
-    steps, last, begin, end, tile, cells, weight, starts, ends, stiff, directions, across, fields, keep, sums, table
-):
-    """Some steps on particles begin to end - 1, a tile at a time, the sums added to while the tile is in cache.
+@lru_cache
+def gathered(components: int, fields: int):
+    """The kernel for so many components of one or two fields, known when it is compiled: loops over them unroll.
 
-    Args:
+    It makes some steps on particles begin to end - 1, a tile at a time, the sums added to while the tile is in cache:
+
         steps: the steps k, as a range (first, after the last); step k makes T_k of T_k-1 and T_k-2.
         last: the last step of all, at which the terms not yet added are.
         tile: particles treated at a time.
-        cells: (2, particle, column), T_k in cells[k % 2].
+        cells: (2, particle, column), T_k in cells[k % 2]; columns are (field, component), fields T u, T v, or both.
         weight: 4 / (W^2 m), (particle,).
         starts, ends: neighbors of particle p are ends[starts[p] : starts[p + 1]], as offsets into the flat cells.
         stiff, directions, across: of each of these bonds, with one component its k; with more the sign of k - T / L
             (empty where none is negative), n times the root of its size (slot and component,), and T / L (empty without tension).
-        fields: T u, T v, or both: columns are (field, component).
         keep: scratch (tile, column).
         sums: (output, 2, particle, component), displacement and velocity.
         table: (output, term, 2, field), what each T of each field contributes to displacement and velocity.
     """
-    columns = cells.shape[2]
-    components = columns // fields
-    for k in range(steps[0], steps[1]):
-        old, now = cells[k % 2], cells[(k + 1) % 2]
-        to, of = old.reshape(-1), now.reshape(-1)
-        count, terms = _terms(k, last, table)
-        for low in range(begin, end, tile):
-            high = min(low + tile, end)
-            if count:
-                for p in range(low, high):
+    columns, width = components * fields, _U(components * fields)
+    slot, nothing, origin = _U(components), (0.0,) * columns, (0.0,) * components
+
+    @_kernel
+    def run(steps, last, begin, end, cells, sums, table, keep, ends, tile, weight, starts, stiff, directions, across):
+        prestressed, signed = len(across) > 0, len(stiff) > 0
+        for k in range(steps[0], steps[1]):
+            old, now = cells[k % 2], cells[(k + 1) % 2]
+            to, of, first = old.reshape(-1), now.reshape(-1), k == 1
+            count, terms = _terms(k, last, table)
+            for low in range(begin, end, tile):
+                high = min(low + tile, end)
+                if count:
+                    for p in range(low, high):
+                        for c in range(columns):
+                            keep[p - low, c] = old[p, c]
+                for p in range(_U(low), _U(high)):
+                    at = width * p
+                    x, force = nothing, nothing
                     for c in range(columns):
-                        keep[p - low, c] = old[p, c]
-            first = k == 1
-            if components == 1 and fields == 1:
-                _gathered_1_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
-            elif components == 1 and fields == 2:
-                _gathered_1_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
-            elif components == 2 and fields == 1:
-                _gathered_2_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
-            elif components == 2 and fields == 2:
-                _gathered_2_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
-            elif components == 3 and fields == 1:
-                _gathered_3_1(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
-            elif components == 3 and fields == 2:
-                _gathered_3_2(low, high, to, of, weight, starts, ends, stiff, directions, across, first)
-            if count:
-                _add(low, high, keep, old, now, fields, sums, terms)
+                        x = tuple_setitem(x, c, of[at + _U(c)])
+                    for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
+                        q = _U(ends[s])
+                        if components == 1:
+                            for c in range(columns):
+                                force = tuple_setitem(force, c, force[c] + stiff[s] * (of[q + _U(c)] - x[c]))
+                            continue
+                        n = origin
+                        for a in range(components):
+                            n = tuple_setitem(n, a, directions[slot * s + _U(a)])
+                        for r in range(0, columns, components):
+                            apart, pull = origin, 0.0
+                            for a in range(components):
+                                apart = tuple_setitem(apart, a, of[q + _U(r + a)] - x[r + a])
+                                pull += n[a] * apart[a]
+                            if signed:
+                                pull *= stiff[s]
+                            for a in range(components):
+                                force = tuple_setitem(force, r + a, force[r + a] + n[a] * pull)
+                            if prestressed:
+                                for a in range(components):
+                                    force = tuple_setitem(force, r + a, force[r + a] + across[s] * apart[a])
+                    w = weight[p]
+                    for c in range(columns):
+                        if first:
+                            to[at + _U(c)] = x[c] + 0.5 * w * force[c]
+                        else:
+                            to[at + _U(c)] = w * force[c] + (2.0 * x[c] - to[at + _U(c)])
+                if count:
+                    _add(low, high, keep, old, now, fields, sums, terms)
+
+    return run
 
 
 @_kernel
@@ -307,8 +124,8 @@ def _add(low, high, keep, new, now, fields, sums, terms):
 
 @_kernel
 def rows(
-    steps, last, begin, end, cells, weight, neighbors, shifts, stiff, axes, parts, across, pad, fields, components,
-    wrap, pulls, force, keep, sums, table,
+    steps, last, begin, end, cells, sums, table, pulls, force, keep, weight, neighbors, shifts, stiff, axes, parts,
+    across, pad, components, wrap,
 ):  # fmt: skip
     """Some steps on rows begin to end - 1 of a lattice.
 
@@ -316,7 +133,7 @@ def rows(
     many that it gives up vectorizing.
 
     Args:
-        steps, last, fields, table: as for :func:`gathered`.
+        steps, last, table: as for :func:`gathered`.
         cells: (2, field and component, row, width + 2 pad), T_k in cells[k % 2]; the pads hold copies of the other end,
             or walls at rest; the last row, beyond those of the lattice, is at rest.
         weight: (row, width).
@@ -328,14 +145,14 @@ def rows(
         across: T / L in the shape of ``stiff``; empty without tension.
         wrap: whether the rows are rings.
         pulls: scratch (step, width).
-        force: scratch (width,).
-        keep: scratch (width,).
+        force, keep: scratch (1, width).
         sums: (output, 2, component, row, width).
     """
     varied = stiff.shape[1] * stiff.shape[2] > 1
     half = len(shifts) // 2
     used = len(shifts) if varied else half
-    width = len(force)
+    force, keep = force[0], keep[0]
+    width, fields = len(force), cells.shape[1] // components
     for k in range(steps[0], steps[1]):
         old, now = cells[k % 2], cells[(k + 1) % 2]
         count, terms = _terms(k, last, table)

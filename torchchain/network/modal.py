@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import State
-from torchchain.evolvers.method import Advance, Method
+from torchchain.evolvers.method import Advance
+from torchchain.evolvers.modes import METHOD as CHAINS
 from torchchain.modes import phase
 from torchchain.network.modes import NetworkModes, normal_modes
 from torchchain.network.networks import Network
@@ -55,16 +58,12 @@ def start(network: Network, state: State, modes: NetworkModes | None = None) -> 
     return advance
 
 
-METHOD = Method(
-    name="modes",
+METHOD = replace(
+    CHAINS,
     start=start,
-    summary="all normal modes by batched eigen-decomposition, then a sum over modes at each time",
-    order="exact; the phase error grows as w t eps",
-    conserves="energy of every mode",
     stability="unconditional; networks that are not stable are refused",
     cost="(n c)^3 once for n particles of c components, (n c)^2 per output time; (n c)^2 memory",
     cannot="damping, contacts that open, more than some thousand unknowns",
-    candidate=True,
     matrices=12,
     options={"modes": "NetworkModes of the network, where they are at hand"},
 )

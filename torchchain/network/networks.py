@@ -11,6 +11,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.network import bonds
 
 MOTIONS = ("vector", "scalar")
 SWEEPS = 8  # of the bound's power iteration
@@ -88,20 +89,24 @@ class Network:
             )
         put("positions", positions)
         checks.choice("motion", self.motion, MOTIONS)
-        put("box", self._checked_box())
+        put("box", None if self.box is None else bonds.checked_box(self.box, positions))
         if self.anchors is not None:
             anchors = checks.real_tensor("anchors", self.anchors).to(masses)
             if anchors.ndim != 2 or anchors.shape[1] != self.dimension:
                 raise checks.fail("anchors", f"have shape (anchor, {self.dimension})", f"shape {tuple(anchors.shape)}")
             put("anchors", anchors)
-        put("bonds", self._checked_bonds())
+        found, images = bonds.checked_bonds(self.bonds, self.images, n, self.n_anchors, positions, self.box is not None)
+        put("bonds", found)
+        put("images", images)
         put("bond_vectors", self._bond_vectors())
         lengths = self.bond_vectors.square().sum(-1).sqrt()
         scale = torch.finfo(masses.dtype).eps * max(float(self.points.detach().abs().max()), 1e-300)
         checks.first_bad("length of bonds", "be positive", lengths, lengths <= scale, "bond")
         put("lengths", lengths)
         put("directions", self.bond_vectors / lengths[:, None])
-        self._check_box_and_doubles()
+        if self.box is not None and self.images is None:
+            bonds.check_shorter_than_half(lengths, self.box)
+        bonds.check_doubles(self.bonds, self.images)
         for name in ("stiffness", "tension", "damping"):
             put(name, self._per_bond(name, getattr(self, name), signed=name == "tension"))
         if self.motion == "scalar" and bool((torch.as_tensor(self.tension) != 0).any()):
@@ -109,64 +114,6 @@ class Network:
             raise checks.fail(
                 "tension", "be zero for motion 'scalar', whose stiffness is all there is", f"up to {worst:g}"
             )
-
-    def _checked_box(self) -> Tensor | None:
-        if self.box is None:
-            return None
-        d = self.dimension
-        box = _as_tensor("box", self.box, "None or real numbers").to(self.positions)
-        if box.ndim == 0:
-            raise checks.FieldTypeError(f"box must be None or have shape ({d},) or ({d}, {d}), got {self.box!r}")
-        if tuple(box.shape) not in ((d,), (d, d)):
-            raise checks.fail("box", f"have shape ({d},) or ({d}, {d})", f"shape {tuple(box.shape)}")
-        if box.ndim == 1:
-            checks.first_bad("box", "be positive", box, ~(box > 0), "direction")
-            return box
-        checks.finite("box", box)
-        volume = torch.linalg.det(box).abs().item()
-        if not volume > 1e-12 * box.norm(dim=-1).prod().item():
-            raise checks.fail("box", "have rows that span a volume", f"a volume of {volume:g}")
-        return box
-
-    def _checked_bonds(self) -> Tensor:
-        bonds = _as_tensor("bonds", self.bonds, "pairs of integers")
-        if bonds.numel() == 0:
-            return torch.zeros((0, 2), dtype=torch.int64, device=self.masses.device)
-        if bonds.is_floating_point() or bonds.is_complex() or bonds.dtype == torch.bool:
-            raise checks.FieldTypeError(f"bonds must be integers, got {bonds.dtype}")
-        if bonds.ndim != 2 or bonds.shape[1] != 2:
-            raise checks.fail("bonds", "have shape (bond, 2)", f"shape {tuple(bonds.shape)}")
-        bonds = bonds.to(self.masses.device, torch.int64)
-        n, top = self.n_particles, self.n_particles + self.n_anchors
-        bad = ((bonds < 0) | (bonds >= top)).any(-1)
-        if bool(bad.any()):
-            b = int(bad.nonzero()[0])
-            more = f" and anchors {n} to {top - 1}" if top > n else ""
-            raise checks.fail("bonds", f"join particles 0 to {n - 1}{more}", f"{_pair(bonds, b)} at bond {b + 1}")
-        bad = (bonds >= n).all(-1)
-        if bool(bad.any()):
-            b = int(bad.nonzero()[0])
-            raise checks.fail(
-                "bonds", "have a particle at one end at least", f"two anchors, {_pair(bonds, b)}, at bond {b + 1}"
-            )
-        if self.images is None:
-            bad = bonds[:, 0] == bonds[:, 1]
-        else:
-            images = torch.as_tensor(self.images).to(bonds.device)
-            if images.is_floating_point() or tuple(images.shape) != (len(bonds), self.dimension):
-                raise checks.fail(
-                    "images",
-                    f"be integers of shape {(len(bonds), self.dimension)}",
-                    f"{images.dtype}, shape {tuple(images.shape)}",
-                )
-            if self.box is None and bool((images != 0).any()):
-                raise checks.fail("images", "be zero without a box", "others")
-            object.__setattr__(self, "images", images.to(torch.int64))
-            bad = (bonds[:, 0] == bonds[:, 1]) & (images == 0).all(-1)
-        if bool(bad.any()):
-            b = int(bad.nonzero()[0])
-            raise checks.fail("bonds", "join two different particles", f"{_pair(bonds, b)} at bond {b + 1}")
-        return bonds
 
     def _bond_vectors(self) -> Tensor:
         points = self.points
@@ -179,30 +126,6 @@ class Network:
             return vectors + torch.where(self.images == 0, 0.0, self.images * self.box)
         return vectors + self.images.to(self.box) @ self.box
 
-    def _check_box_and_doubles(self) -> None:
-        if self.n_bonds == 0:
-            return
-        if self.box is not None and self.images is None:
-            half = self._smallest_width() / 2
-            bad = self.lengths >= half
-            rule = f"be less than half the box, {half:.6g}, where bonds do not name the copy that they end at"
-            checks.first_bad("length of bonds", rule, self.lengths, bad, "bond")
-        low, high = self.bonds.amin(-1), self.bonds.amax(-1)
-        columns = [low, high]
-        if self.images is not None:
-            turned = torch.where((self.bonds[:, 0] > self.bonds[:, 1])[:, None], -self.images, self.images)
-            same = low == high  # a particle and its own copy: either sense is the same bond
-            first = turned.gather(1, (turned != 0).to(torch.int8).argmax(-1, keepdim=True))[:, 0]
-            turned = torch.where((same & (first < 0))[:, None], -turned, turned)
-            columns += list(turned.unbind(-1))
-        key = np.stack([column.cpu().numpy() for column in reversed(columns)])
-        order = np.lexsort(key)
-        doubled = (np.diff(key[:, order], axis=1) == 0).all(0)
-        if doubled.any():
-            first_of = int(np.flatnonzero(doubled)[0])
-            a, b = sorted((int(order[first_of]), int(order[first_of + 1])))
-            raise checks.fail("bonds", "differ from each other", f"{_pair(self.bonds, b)} at bonds {a + 1} and {b + 1}")
-
     def _per_bond(self, name: str, value: float | Tensor, signed: bool) -> Tensor:
         value = checks.real_tensor(name, value).to(self.masses)
         if not signed:
@@ -213,13 +136,6 @@ class Network:
         if tuple(value.shape) not in (shape, shape[-1:]):
             raise checks.fail(name, f"be a number or have shape {shape[-1:]} or {shape}", f"shape {tuple(value.shape)}")
         return value
-
-    def _smallest_width(self) -> float:
-        """The smallest distance of two opposite faces of the periodic cell."""
-        assert self.box is not None
-        if self.box.ndim == 1:
-            return self.box.min().item()
-        return 1 / torch.linalg.inv(self.box).norm(dim=0).max().item()
 
     @property
     def n_particles(self) -> int:
@@ -487,18 +403,3 @@ class Network:
 def _product(blocks: Tensor, x: Tensor) -> Tensor:
     """Blocks (..., c, c) times vectors (..., c)."""
     return (blocks * x[..., None, :]).sum(-1)
-
-
-def _pair(bonds: Tensor, b: int) -> str:
-    return f"{int(bonds[b, 0])} and {int(bonds[b, 1])}"
-
-
-def _as_tensor(field: str, value: Any, words: str) -> Tensor:
-    """A tensor of integers or real numbers, infinite ones among them, from whatever holds them."""
-    try:
-        values = value if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
-    except (TypeError, ValueError, OverflowError, RuntimeError):
-        values = torch.zeros(0, dtype=torch.bool)
-    if values.is_complex() or values.dtype == torch.bool or values.layout != torch.strided or values.is_meta:
-        raise checks.FieldTypeError(f"{field} must be {words}, got {checks.shown(value)}")
-    return values

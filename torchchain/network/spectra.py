@@ -17,12 +17,13 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.network.bands import plane_wave
-from torchchain.network.chebyshev import highest_frequency, layout_of
+from torchchain.network.chebyshev import highest_frequency
 from torchchain.network.disorder import uniform
 from torchchain.network.lattices import Lattice, dynamical_matrix, reciprocal
+from torchchain.network.layouts import layout_of
 from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network
+from torchchain.network.plane_waves import plane_wave
 
 _STARTS = 5  # the random stream of the starts
 
