@@ -35,6 +35,8 @@ class Kick:
     """its velocity"""
     method: str = "chebyshev"
     """how the chains are evolved"""
+    kind: str = "normal"
+    """distribution of the masses: normal, uniform, binary, lognormal or gamma"""
 
     @property
     def initial_energy(self) -> float:
@@ -46,7 +48,7 @@ class Kick:
         settings: dict[str, Any] = {
             "n_particles": self.n_particles,
             "boundary": "fixed",
-            "disorder": tc.Disorder(strength=strength),
+            "disorder": tc.Disorder(self.kind, strength),
             "excitation": tc.Impulse(self.site, self.velocity),
             "times": torch.as_tensor(times, dtype=torch.float64),
             "realizations": self.realizations,

@@ -10,9 +10,9 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tomli_w
@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchchain as tc
-from torchchain import checks
+from torchchain import checks, plots
 from torchchain.cli import outputs
 from torchchain.ensemble.scene import read_toml, regular_times
 from torchchain.ensemble.statistics import jackknife_error
@@ -48,6 +48,8 @@ class Ensemble:
     """last time"""
     step: float = 0.25
     """time step of the output"""
+    kind: str = "normal"
+    """distribution of the masses: normal, uniform, binary, lognormal or gamma"""
 
     def scene(self, strength: float, tones: tuple[int, ...] | None = None, **changes: Any) -> tc.Scene:
         """Standing waves on chains of this disorder; ``tones=None``: the center tone of every band."""
@@ -57,7 +59,7 @@ class Ensemble:
             "realizations": self.realizations,
             "seed": self.seed,
             "times": regular_times(0.0, self.stop, self.step),
-            "disorder": tc.Disorder(strength=strength),
+            "disorder": tc.Disorder(self.kind, strength),
             "excitation": tc.StandingWave(tones=tones),
         }
         return tc.Scene(**settings | changes)
@@ -129,7 +131,7 @@ def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
     data = script.measure(flags.settings, flags.device)
     stages["measure"] = time.time() - began
     rows = script.compare(data, flags.settings)
-    figure, report = script.draw(data, flags.settings), _report(script, data, flags.settings, rows)
+    figure, report = _drawn(script, data, flags.settings), _report(script, data, flags.settings, rows)
     stages["figure and table"] = time.time() - began - stages["measure"]
     config = _toml(flags.settings)
     outputs.write(
@@ -137,7 +139,7 @@ def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
         {
             "config.toml": outputs.text(config),
             "results.nc": outputs.dataset(data.assign(_table(rows))),
-            "figure.png": outputs.figure(figure),
+            **outputs.figures(figure, flags.format),
             "report.txt": outputs.text(report),
             "run.json": outputs.run_record(
                 arguments, config, flags.device, began, stages,
@@ -155,9 +157,8 @@ def _redraw(script: Script, flags: Any, out: Path) -> None:
         data = file.load()
     rows = script.compare(data, flags.settings)
     report = _report(script, data, flags.settings, rows)
-    outputs.write(
-        out, {"figure.png": outputs.figure(script.draw(data, flags.settings)), "report.txt": outputs.text(report)}
-    )  # the data and their record stay
+    figure = _drawn(script, data, flags.settings)
+    outputs.write(out, {**outputs.figures(figure, flags.format), "report.txt": outputs.text(report)})  # the rest stays
     print(report, end="")
     print(f"redrawn in {out}")
 
@@ -191,6 +192,7 @@ def _parse(script: Script, settings: Any, arguments: list[str]) -> Any:
             ("config", str | None, flag(None, "settings in a TOML file")),
             ("out", str, flag(f"results/experiments/{script.name}", "folder of the run")),
             ("device", str, flag("cpu", "cpu, cuda, cuda:1, ...")),
+            ("format", Literal["png", "pdf", "svg"], flag("png", "of the figure, besides PNG")),
             ("smoke", switch, flag(False, "few chains and short times: seconds")),
             ("redraw", switch, flag(False, "figure and table from the data saved in --out, no run")),
         ],
@@ -236,10 +238,26 @@ def _table(rows: list[Row]) -> dict[str, Any]:
     }
 
 
+def _drawn(script: Script, data: xarray.Dataset, config: Any) -> Figure:
+    with plots.style():
+        return script.draw(data, config)
+
+
+def changed(script: Script, config: Any) -> list[str]:
+    """The settings of a figure of the paper that are not its own, so that neither its digits nor conclusions apply."""
+    if not script.name.startswith("fig"):
+        return []
+    free = ("seed", "realizations")
+    fields = (entry.name for entry in dataclasses.fields(config) if entry.name not in free)
+    return [name for name in fields if getattr(config, name) != getattr(script.config, name)]
+
+
 def _report(script: Script, data: xarray.Dataset, config: Any, rows: list[Row]) -> str:
     """The table as text, and the words below it."""
     lines = [("quantity", "paper", "measured", "sigmas", "")]
-    for row in rows:
+    other = changed(script, config)
+    words = script.explain(data, config).strip() if not other else f"no conclusions: not the paper's {', '.join(other)}"
+    for row in [replace(row, paper="") for row in rows] if other else rows:
         error = "" if math.isnan(row.stderr) else f" +- {row.stderr:.2g}"
         lines.append(
             (
@@ -253,12 +271,13 @@ def _report(script: Script, data: xarray.Dataset, config: Any, rows: list[Row]) 
     filled = [column for column in zip(*lines, strict=True) if any(column[1:])]
     widths = [max(map(len, column)) for column in filled]
     table = ["  ".join(f"{c:<{w}}" for c, w in zip(line, widths, strict=True)) for line in zip(*filled, strict=True)]
-    return "\n".join([script.name, *(line.rstrip() for line in table), script.explain(data, config).strip()]) + "\n"
+    return "\n".join([script.name, *(line.rstrip() for line in table), words]) + "\n"
 
 
 def panels(rows: int, columns: int, width: float = 4.8, height: float = 3.7) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes [row, column]; width and height of one of them in inches."""
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    """A figure as wide as a journal's page (one panel: two thirds) and its axes [row, column], each of the shape width to height."""
+    across = plots.PAGE if columns > 1 else plots.PAGE * 2 / 3
+    figure = Figure(figsize=(across, across / columns * height / width * rows), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
