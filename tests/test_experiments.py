@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import re
 import sys
 import tomllib
 from dataclasses import replace
@@ -170,3 +171,19 @@ def test_eq_28_as_printed_is_what_puts_the_energy_on_light_particles():
     light = data.light_among_top.mean("realization")
     assert float(light.sel(case="Eq. 26")) <= 1
     assert float(light.sel(case="Eq. 28 as printed")) >= 3
+
+
+def test_no_conclusions_from_other_settings(tmp_path):
+    out = tmp_path / "fig12"
+    assert fig12.main(["--smoke", "--kind", "uniform", "--format", "pdf", "--out", str(out)]) == 0
+    text = (out / "report.txt").read_text()
+    assert re.search(r"no conclusions: not the paper's .*\bkind\b", text)
+    assert "paper " not in text.splitlines()[1]
+    assert (out / "figure.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("name", [name for name in SCRIPTS if name.startswith("fig")])
+def test_the_papers_own_settings_are_its_own(name):
+    script = SCRIPTS[name]
+    assert harness.changed(script, replace(script.config, seed=7, realizations=9)) == []
+    assert harness.changed(script, replace(script.config, kind="binary")) == ["kind"]
