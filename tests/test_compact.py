@@ -8,20 +8,13 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.master import compact
+from torchchain.master import logistic, waves
 from torchchain.master.certificate import certify
-from torchchain.master.compact import (
-    CompactModel,
-    Regression,
-    Waves,
-    chosen_times,
-    first_odds,
-    fit_compact,
-    fit_compact_family,
-    n_coefficients,
-    regression,
-)
+from torchchain.master.compact import CompactModel, n_coefficients
+from torchchain.master.compact_family import fit_compact_family
+from torchchain.master.logistic import Regression, chosen_times, fit_compact, regression
 from torchchain.master.misfit import model_error
+from torchchain.master.waves import Waves, first_odds
 
 B = 8
 ZERO = torch.zeros(B, B, dtype=torch.float64)
@@ -41,9 +34,9 @@ def transfers():
 
 
 def model_of(coefficients, strength=0.3, degrees=DEGREES):
-    waves = Waves.of(scene(strength))
+    found = Waves.of(scene(strength))
     return CompactModel(
-        ZERO, torch.tensor(degrees, dtype=torch.float64), torch.as_tensor(coefficients, dtype=torch.float64), **waves.tensors()
+        ZERO, torch.tensor(degrees, dtype=torch.float64), torch.as_tensor(coefficients, dtype=torch.float64), **found.tensors()
     )  # fmt: skip
 
 
@@ -91,8 +84,8 @@ def test_transfer_starts_as_the_fourth_power_of_time():
 
 def test_first_odds_agree_with_perturbation_theory():
     """Without decay, one tone to another: xi^2 w w' ((1 - cos D t) / D^2 - (1 - cos S t) / S^2), D and S their difference and sum."""
-    waves = Waves.of(scene(0.01))
-    still = Waves(waves.source_frequency, waves.source_decay * 0 + 1e-12, waves.tone_frequency[:, :1], waves.tone_decay[:, :1] * 0 + 1e-12, waves.coupling)  # fmt: skip
+    born = Waves.of(scene(0.01))
+    still = Waves(born.source_frequency, born.source_decay * 0 + 1e-12, born.tone_frequency[:, :1], born.tone_decay[:, :1] * 0 + 1e-12, born.coupling)  # fmt: skip
     times = torch.tensor([0.02, 0.09999, 0.10001, 0.5, 1.0], dtype=torch.float64)
     found = first_odds(still, times, torch.arange(B))
     w, other = still.source_frequency[:, None, None], still.tone_frequency[:, 0]
@@ -102,21 +95,21 @@ def test_first_odds_agree_with_perturbation_theory():
     # the floor adds at most (FLOOR envelope / odds)^2 of them, the square of about FLOOR times two
     relative = (found / exact - 1).abs()
     assert (
-        float(relative[far].max()) < 4 * compact.FLOOR**2 + 1e-4
+        float(relative[far].max()) < 4 * waves.FLOOR**2 + 1e-4
     )  # cancellation at t = 0.02 leaves the series as the exact one
 
 
 def test_series_and_closed_form_meet():
-    waves = Waves.of(scene())
-    edge = torch.tensor([compact.SERIES * (1 - 1e-9), compact.SERIES * (1 + 1e-9)], dtype=torch.float64)
-    before, after = first_odds(waves, edge, torch.arange(B)).unbind(1)
+    medium = Waves.of(scene())
+    edge = torch.tensor([waves.SERIES * (1 - 1e-9), waves.SERIES * (1 + 1e-9)], dtype=torch.float64)
+    before, after = first_odds(medium, edge, torch.arange(B)).unbind(1)
     off = ~torch.eye(B, dtype=torch.bool)  # odds of the own band are not used
     assert float((after / before - 1).abs()[off].max()) < 1e-7  # t^4 itself changes by 8e-9
 
 
 def test_born_decay_in_weak_disorder():
     frequency = 2 * np.sin(np.linspace(0.3, 2.2, 9) / 2)
-    poles = compact._poles(frequency, 0.02)
+    poles = waves._poles(frequency, 0.02)
     born = 0.02**2 * np.sin(np.linspace(0.3, 2.2, 9) / 2) * np.tan(np.linspace(0.3, 2.2, 9) / 2)
     np.testing.assert_allclose(-poles.imag, born, rtol=5e-3)
 
@@ -181,9 +174,9 @@ def test_a_step_of_gauss_and_newton_is_a_fit_to_other_data(transfers):
     moved = problem.data.copy()
     picked = chosen_times(own.times)
     moved[:, : len(picked)] += 0.05 * (own.block_mean[0][:, picked].numpy() - problem.data[:, : len(picked)])
-    same, changed = compact.refitted(problem, model, [problem.data, moved])
+    same, changed = logistic.refitted(problem, model, [problem.data, moved])
     again = Regression(problem.odds, problem.shape, problem.clock, problem.held, moved, problem.weight)
-    found, _ = compact.solve([again], np.ones((1, 1)), model.coefficients.numpy()[None])
+    found, _ = logistic.solve([again], np.ones((1, 1)), model.coefficients.numpy()[None])
     times = own.times
     exact = CompactModel(**{**model.tensors(), "coefficients": torch.from_numpy(found[0])}).transfer(times)
     step = (exact - model.transfer(times)).abs().max()
@@ -199,7 +192,7 @@ def test_fits_are_deterministic(transfers):
 def test_chosen_times_are_few_sorted_and_include_the_last():
     times = torch.cat([torch.arange(0, 200, 0.25), torch.arange(200, 5000, 10.0)]).double()
     picked = chosen_times(times)
-    assert len(picked) <= compact.FIT_TIMES
+    assert len(picked) <= logistic.FIT_TIMES
     assert picked[-1] == len(times) - 1
     assert bool((picked.diff() > 0).all())
     assert float(times[picked[0]]) == 0.25

@@ -1,0 +1,132 @@
+"""Waves of an effective medium, and the odds that one has scattered into another: perturbation theory, damped.
+
+A wave of frequency w and decay g scatters into one of w', g' with the odds
+
+    D = c w w' (h(w - w') - h(w + w')),   h(x) = (1 - exp(-G t) (cos x t + G sin(x t) / x)) / (x^2 + G^2),   G = g + g',
+
+which start as t^4 and end as a Lorentzian. w and g are those of the self-consistent Born approximation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.ensemble.scene import Scene
+
+FLOOR = 0.05
+"""The odds' first guess stays above this share of its envelope: where waves have beaten to rest, others have come."""
+TONES = 8
+"""Tones of a receiving band that are summed over; of more, as many spread evenly."""
+SERIES = 0.1
+"""Up to this time D is summed in powers of t, beyond as it stands: differences of cosines lose digits at first."""
+SERIES_ORDER = 14
+WIDTH = 0.8
+"""Decay rates in D, relative to the Born approximation's: with the distance in these units the rest is smoothest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """The waves of an effective medium: frequencies and decay rates of amplitudes, per unit time.
+
+    Attributes:
+        source_frequency, source_decay: of the tone of each source, (band,).
+        tone_frequency, tone_decay: of tones in each receiving band, (band, tone).
+        coupling: c, the variance of the disorder for each tone.
+    """
+
+    source_frequency: Tensor
+    source_decay: Tensor
+    tone_frequency: Tensor
+    tone_decay: Tensor
+    coupling: Tensor
+
+    @classmethod
+    def of(cls, scene: Scene, strength: float | None = None) -> Waves:
+        """The waves of a scene's chains, in the self-consistent Born approximation.
+
+        Args:
+            scene: with one tone in each band.
+            strength: standard deviation of the masses, and of the contacts if they vary too; None for the scene's.
+        """
+        if strength is None:
+            other = scene.stiffness_disorder
+            strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
+        strength = checks.number("strength", strength, above=0)
+        n, bands = scene.n_particles, scene.n_bands
+        width = n // 2 // bands
+        inside = np.arange(width) if width <= TONES else (np.arange(TONES) + 0.5) * width / TONES - 0.5
+        tones = np.arange(bands)[:, None] * width + inside + 1
+        source = _poles(2 * np.sin(np.pi / n * np.array(scene.tones, dtype=float)), strength)
+        receiver = _poles(2 * np.sin(np.pi / n * tones), strength)
+        coupling = strength**2 / n * width / len(inside)
+        found = (source.real, -WIDTH * source.imag, receiver.real, -WIDTH * receiver.imag)
+        frequency, decay, others, other_decay = (torch.from_numpy(value.copy()) for value in found)
+        return cls(frequency, decay, others, other_decay, torch.tensor(coupling, dtype=torch.float64))
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {
+            "source_frequency": self.source_frequency, "source_decay": self.source_decay,
+            "tone_frequency": self.tone_frequency, "tone_decay": self.tone_decay, "coupling": self.coupling,
+        }  # fmt: skip
+
+
+def _poles(frequency: np.ndarray, strength: float) -> np.ndarray:
+    """Complex frequencies z = w / sqrt(mu(Re z)) of waves of the ordered chain's frequency w, imaginary parts below 0.
+
+    The effective mass mu = 1 + xi^2 z^2 g with the local response g = 1 / sqrt(e (e - 4)), e = z^2 mu, Im g > 0, of the
+    infinite chain; by damped iteration. In weak disorder -Im z = xi^2 sin(k/2) tan(k/2), half of Born's decay rate.
+    """
+    z, mu = frequency + 0j, np.full(frequency.shape, 1 + 1e-3j)
+    for _ in range(400):
+        squared = z.real**2
+        g = 1 / np.sqrt(squared * mu * (squared * mu - 4))
+        mu = 0.6 * mu + 0.4 * (1 + strength**2 * squared * np.where(g.imag < 0, -g, g))
+        z = 0.6 * z + 0.4 * frequency / np.sqrt(mu)
+    return np.where(z.imag > 0, z.conj(), z)
+
+
+def first_odds(waves: Waves, times: Tensor, sources: Tensor) -> Tensor:
+    """D [source, time, receiver], positive, of some sources; times may be infinite."""
+    w, g = waves.source_frequency[sources][:, None, None, None], waves.source_decay[sources][:, None, None, None]
+    other, decay = waves.tone_frequency[:, :, None], waves.tone_decay[:, :, None]  # [receiver, tone, time]
+    rate = g + decay
+    size = waves.coupling * w * other
+    slow, fast = (w - other).abs(), w + other
+    finite = times.isfinite()
+    t = torch.where(finite, times, torch.zeros_like(times))
+    beat = _response(slow, rate, t) - _response(fast, rate, t)
+    beat = torch.where(t < SERIES, _early(slow, fast, rate, t.clamp(max=SERIES)), beat)
+    late = 1 / (slow**2 + rate**2) - 1 / (fast**2 + rate**2)
+    beat = torch.where(finite, beat, late)
+    # t^4 w w' / 6 at first, and a Lorentzian in the end
+    squared = t**2
+    rise = squared**2 * w * other / 6 / ((1 + squared * fast**2 / 12) * (1 + squared * (slow**2 + rate**2) / 2))
+    ending = 4 * w * other / (fast**2 * (slow**2 + rate**2))
+    least = FLOOR * torch.where(finite, rise, ending)
+    beat = size * (beat + (beat**2 + 4 * least**2).sqrt()) / 2
+    return beat.sum(2).transpose(1, 2)
+
+
+def _response(x: Tensor, rate: Tensor, t: Tensor) -> Tensor:
+    """h(x): what obeys h'' + 2 G h' + (G^2 + x^2) h = 1 from rest."""
+    return (1 - torch.exp(-rate * t) * (torch.cos(x * t) + rate * t * torch.sinc(x * t / math.pi))) / (x**2 + rate**2)
+
+
+def _early(slow: Tensor, fast: Tensor, rate: Tensor, t: Tensor) -> Tensor:
+    """h(slow) - h(fast) in powers of t from t^4, where the two begin to differ."""
+    result = torch.zeros_like(slow * t)
+    pairs = []
+    for x in (slow, fast):
+        derivatives = [torch.ones_like(x * rate), -2 * rate + 0 * x]
+        for _ in range(4, SERIES_ORDER + 1):
+            derivatives.append(-2 * rate * derivatives[-1] - (rate**2 + x**2) * derivatives[-2])
+        pairs.append(derivatives)
+    for order in range(4, SERIES_ORDER + 1):
+        result = result + (pairs[0][order - 2] - pairs[1][order - 2]) * t**order / math.factorial(order)
+    return result
