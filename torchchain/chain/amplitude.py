@@ -126,6 +126,8 @@ def warn_if_nonlinear(chain: Chain, state: State, limit: float = 0.05, stackleve
         if checks.is_transformed(estimate):
             return
         largest = estimate.amax()
+        if largest.item() <= min(1, 3 * limit):  # a closed contact's deviation is at most a third of its elongation
+            return
         deviation = force_deviation(largest).item()
         if not deviation > limit:
             return

@@ -7,6 +7,7 @@ from typing import Any
 
 from torchchain.progress import log
 
+_seen: set[int] = set()
 _said = False
 
 
@@ -24,6 +25,9 @@ def at_hand(kernel: Any) -> bool:
 def announce(kernel: Any) -> None:
     """Say that a kernel is about to be compiled, unless it is at hand; once in a process."""
     global _said
-    if not (_said or at_hand(kernel)):
+    if _said or id(kernel) in _seen:
+        return
+    _seen.add(id(kernel))  # kernels are never collected
+    if not at_hand(kernel):
         _said = True
         log.warning("compiling kernels once, some 20 s ...")

@@ -65,7 +65,8 @@ def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Te
             # sin(w t) / w, which is t for the zero mode of a periodic chain (Eq. 21 divides by its w = 0)
             position = position + (t * torch.sinc(angle / math.pi)) * velocity
             speed = speed + cosine * velocity
-        shape = torch.broadcast_shapes(position.shape, angle.shape)
-        return position.expand(shape), speed.expand(shape)
+        if not (displaced or moves):
+            position = speed = position * angle  # at every time
+        return position, speed
 
     return motion
