@@ -1,0 +1,281 @@
+"""Energy that Hertz contacts mix: second harmonic, triads of bands of frequency, and the time to equipartition."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass
+
+import harness
+import numpy as np
+import torch
+import xarray
+from harness import Row
+from matplotlib.figure import Figure
+
+import torchchain as tc
+from torchchain.mixing import FrequencyBands, TriadFit, fit_triads, measure_mixing
+
+
+@dataclass(frozen=True)
+class Config:
+    seed: int = 0
+    """seed of the ensembles"""
+    n_particles: int = 128
+    """particles per chain"""
+    realizations: int = 48
+    """chains in each ensemble"""
+    kind: str = "normal"
+    """of the mass disorder"""
+    strength: float = 0.3
+    """disorder xi"""
+    n_bands: int = 12
+    """bands of frequency"""
+    top: float = 0.0
+    """upper edge of the last band; 0: above 98 % of the modes"""
+    amplitudes: tuple[float, ...] = (0.025, 0.05, 0.1)
+    """root mean square elongations of the starts from which G is fitted"""
+    tests: tuple[float, ...] = (0.05, 0.1, 0.2)
+    """those of the held-out starts"""
+    pairs: tuple[str, ...] = ("4:0.5 6:0.5", "3:0.3 7:0.7", "2:0.5 9:0.5")
+    """held-out starts: bands, counted from 1, and their shares"""
+    amplitude: float = 0.02
+    """of the traveling wave in the ordered chain, in initial overlaps"""
+    tone: int = 10
+    """its tone"""
+    slow_stop: float = 32.0
+    """end of the runs to equipartition, in units of 1 / amplitude^2"""
+
+
+SMOKE = Config(n_particles=32, realizations=6, n_bands=5, amplitudes=(0.15, 0.2), tests=(0.2,), pairs=("2:0.5 3:0.5",), tone=2, slow_stop=16.0)  # fmt: skip
+
+
+def scene(config: Config, seed: int) -> tc.Scene:
+    return tc.Scene(
+        n_particles=config.n_particles, boundary="fixed", n_bands=1, realizations=config.realizations, seed=seed,
+        disorder=tc.Disorder(config.kind, config.strength),
+    )  # fmt: skip
+
+
+def second_harmonic(config: Config) -> dict[str, tuple[str, np.ndarray]]:
+    """Amplitude of tone 2 n after a traveling wave of tone n, measured and in closed form."""
+    n, k = config.n_particles, 2 * math.pi * config.tone / config.n_particles
+    chain = tc.Chain(torch.ones(n, dtype=torch.float64), contact="hertz")
+    phase = k * torch.arange(n, dtype=torch.float64)
+    speed = 2 * math.sin(k / 2)
+    state = tc.State(config.amplitude * phase.cos(), config.amplitude * speed * phase.sin())
+    beat = 4 * math.sin(k / 2) * (1 - math.cos(k / 2))
+    times = torch.linspace(0, 4 * math.pi / beat, 401, dtype=torch.float64)
+    path = tc.evolve(chain, state, times, method="symplectic4", step=0.05)
+    double = 2 * math.sin(k)  # of the harmonic; its wave to the right has w u = i v
+    wave = torch.fft.fft(path.displacement)[:, 2 * config.tone] / n
+    motion = torch.fft.fft(path.velocity)[:, 2 * config.tone] / n
+    right = (wave - motion / (1j * double)).abs()  # of exp(-i w t): v = -i w u; twice the half
+    law = 2 * config.amplitude**2 / 8 / math.tan(k / 2) * np.abs(np.sin(beat * times.numpy() / 2))
+    return {"harmonic": ("beat_time", right.numpy()), "harmonic_law": ("beat_time", law), "beat_time": ("beat_time", times.numpy())}  # fmt: skip
+
+
+def shares(config: Config) -> torch.Tensor:
+    found = torch.zeros(len(config.pairs), config.n_bands, dtype=torch.float64)
+    for row, words in zip(found, config.pairs, strict=True):
+        for word in words.split():
+            band, share = word.split(":")
+            row[int(band) - 1] = float(share)
+    return found
+
+
+def measure(config: Config, device: str) -> xarray.Dataset:
+    chain = scene(config, config.seed).chain(range(min(8, config.realizations)))
+    bands = FrequencyBands(config.n_bands, config.top) if config.top else FrequencyBands.covering(chain, config.n_bands)
+    data = second_harmonic(config)
+    found: dict[float, TriadFit] = {
+        a: fit_triads(measure_mixing(scene(config, config.seed), a, bands)) for a in config.amplitudes
+    }
+    data["coupling"] = ("amplitude", "triad"), np.stack([f.model.coupling.detach().numpy() for f in found.values()])
+    data["coupling_stderr"] = ("amplitude", "triad"), np.stack([f.stderr.numpy() for f in found.values()])
+    model = found[config.amplitudes[len(config.amplitudes) // 2]].model
+    data["triads"] = ("triad", "wave"), model.triads.numpy() + 1
+    slow = torch.linspace(0, 8, 33, dtype=torch.float64)
+    for i, a in enumerate(config.tests):
+        test = measure_mixing(scene(config, config.seed + 1), a, bands, starts=shares(config), times=slow / a**2)
+        predicted = model.solve(test.mean[:, 0], test.times).detach()
+        for name, values in (("chains", test.mean), ("chains_stderr", test.stderr), ("triads_energy", predicted)):
+            data[f"{name}_{i}"] = ("start", "slow_time", "band"), (values / a**2).numpy()
+        data[f"opened_{i}"] = ("start",), test.opened.numpy()
+    one = torch.zeros(1, config.n_bands, dtype=torch.float64)
+    one[0, config.n_bands // 3] = 1
+    late = torch.linspace(0, config.slow_stop, 97, dtype=torch.float64)
+    distance = []
+    for a in config.amplitudes:
+        run = measure_mixing(scene(config, config.seed + 2), a, bands, starts=one, times=late / a**2)
+        each = run.energies[:, 0] / a**2
+        even = run.density / run.density.sum()
+        distance.append(
+            torch.stack([0.5 * (half.mean(0) - even).abs().sum(-1) for half in (each, each[::2], each[1::2])]).numpy()
+        )
+    solved = 0.5 * (model.solve(one * 0.01, late / 0.01).detach()[0] / 0.01 - even).abs().sum(-1)
+    data["distance"] = ("amplitude", "half", "late"), np.stack(distance)
+    data["distance_model"] = ("late",), solved.numpy()
+    coords = {
+        "amplitude": list(config.amplitudes),
+        "slow_time": slow.numpy(),
+        "late": late.numpy(),
+        "band": np.arange(1, config.n_bands + 1),
+    }
+    return xarray.Dataset(data, coords=coords)
+
+
+def equipartition_times(data: xarray.Dataset) -> np.ndarray:
+    """When the distance from equipartition has fallen to three quarters of its start, (amplitude, half), NaN if it has not."""
+    late = data.late.values
+    found = np.full(data.distance.shape[:2], np.nan)
+    for i, a in enumerate(data.amplitude.values):
+        for j, path in enumerate(data.distance.values[i]):
+            below = np.flatnonzero(path < 0.75 * path[0])
+            if len(below) and below[0]:
+                k = below[0]
+                part = (path[k - 1] - 0.75 * path[0]) / (path[k - 1] - path[k])
+                found[i, j] = (late[k - 1] + part * (late[k] - late[k - 1])) / a**2
+    return found
+
+
+def exponents(data: xarray.Dataset) -> tuple[float, float]:
+    """Exponent of the time to equipartition in the elongation, and its error from two halves of the ensemble."""
+    times = np.log(equipartition_times(data))
+    log_a = np.log(data.amplitude.values)
+    whole, first, second = (
+        np.polyfit(log_a, times[:, j], 1)[0] if np.isfinite(times[:, j]).all() else np.nan for j in range(3)
+    )
+    return float(whole), float(abs(first - second) / 2)
+
+
+def early_rates(data: xarray.Dataset, config: Config) -> np.ndarray:
+    """Growth of the energy outside of the two bands of the first held-out start, per slow time, at every amplitude (test,).
+
+    From slow time 1/2 on: before it, the harmonics that are carried along without resonance come and go.
+    """
+    kept = [int(word.split(":")[0]) for word in config.pairs[0].split()]
+    found = []
+    for i in range(len(config.tests)):
+        outside = 1 - data[f"chains_{i}"][0].sel(band=kept).sum("band")
+        found.append(float((outside[6] - outside[2]) / (data.slow_time[6] - data.slow_time[2])))
+    return np.array(found)
+
+
+def draw(data: xarray.Dataset, config: Config) -> Figure:
+    figure, axes = harness.panels(2, 3, width=4.4, height=3.6)
+    ax = axes[0, 0]
+    ax.plot(data.beat_time, 1e4 * data.harmonic, label="chain")
+    ax.plot(data.beat_time, 1e4 * data.harmonic_law, "k--", label="closed form")
+    ax.set(xlabel="time $t$", ylabel="amplitude of tone $2n$ ($10^{-4}$)", title="(a) second harmonic, ordered chain")
+    ax.legend(fontsize="small")
+    ax = axes[0, 1]
+    first, second = data.coupling[0], data.coupling[1]
+    ax.errorbar(first, second, data.coupling_stderr[1], data.coupling_stderr[0], "o", ms=3, lw=0.6)
+    ax.axline((0, 0), slope=1, color="k", lw=0.8)
+    ax.set(
+        xlabel=f"$G$ at elongation {config.amplitudes[0]:g}", ylabel=f"$G$ at elongation {config.amplitudes[1]:g}",
+        title="(b) couplings, energies 4 times apart",
+    )  # fmt: skip
+    for i, panel in ((0, axes[0, 2]), (len(config.tests) - 1, axes[1, 0])):
+        ax, chains, model = panel, data[f"chains_{i}"][0], data[f"triads_energy_{i}"][0]
+        for j in range(0, config.n_bands, max(1, config.n_bands // 6)):
+            (line,) = ax.plot(data.slow_time, chains[:, j], label=f"band {j + 1}")
+            ax.fill_between(
+                data.slow_time,
+                *(chains[:, j] + s * data[f"chains_stderr_{i}"][0, :, j] for s in (-1, 1)),
+                color=line.get_color(),
+                alpha=0.3,
+            )
+            ax.plot(data.slow_time, model[:, j], "--", color=line.get_color())
+        letter = "c" if i == 0 else "d"
+        ax.set(
+            xlabel="time $\\times$ elongation$^2$", ylabel="share of the energy", yscale="log", ylim=(1e-3, 1),
+            title=f"({letter}) held out, elongation {config.tests[i]:g}; dashed: triads",
+        )  # fmt: skip
+        if i == 0:
+            ax.legend(fontsize="x-small", ncol=2)
+    ax = axes[1, 1]
+    for i, a in enumerate(config.amplitudes):
+        ax.plot(data.late, data.distance[i, 0], label=f"elongation {a:g}")
+    ax.plot(data.late, data.distance_model, "k--", label="triads")
+    ax.set(xlabel="time $\\times$ elongation$^2$", ylabel="distance from equipartition", title="(e) way to equipartition")
+    ax.legend(fontsize="small")
+    ax = axes[1, 2]
+    times = equipartition_times(data)
+    slope, error = exponents(data)
+    ax.loglog(data.amplitude, times[:, 0], "o-", label=f"chains, exponent {slope:.2f} ± {error:.2f}")
+    middle = len(config.amplitudes) // 2
+    ax.loglog(
+        data.amplitude, times[middle, 0] * (data.amplitude / data.amplitude[middle]) ** -2, "k--", label="exponent $-2$"
+    )
+    ax.set(
+        xlabel="root mean square elongation", ylabel="time to 3/4 of the distance", title="(f) time to equipartition"
+    )
+    ax.legend(fontsize="small")
+    figure.suptitle(
+        f"Hertz chains of {config.n_particles}, {config.kind} masses, $\\xi$ = {config.strength:g}", fontsize="medium"
+    )
+    return figure
+
+
+def compare(data: xarray.Dataset, config: Config) -> list[Row]:
+    law, wave = data.harmonic_law.values, data.harmonic.values
+    rows = [
+        Row("second harmonic, largest, over its closed form", float(wave.max() / law.max())),
+        Row("time of its first maximum", float(data.beat_time[: len(law) // 2][wave[: len(law) // 2].argmax()])),
+        Row("the same by the closed form", float(data.beat_time[: len(law) // 2][law[: len(law) // 2].argmax()])),
+    ]
+    for i in range(len(config.amplitudes) - 1):
+        one, other = data.coupling[i], data.coupling[i + 1]
+        error = np.hypot(data.coupling_stderr[i], data.coupling_stderr[i + 1])
+        z = (abs(other - one) / error.clip(1e-12)).values
+        name = f"couplings at elongations {config.amplitudes[i]:g} and {config.amplitudes[i + 1]:g}"
+        rows.append(
+            Row(
+                f"{name}: ratio of sums",
+                float(other.sum() / one.sum()),
+                note=f"{100 * np.mean(z < 1):.0f} % of G within one standard error, median {np.median(z):.2f}",
+            )
+        )
+    rates = early_rates(data, config)
+    for a, rate in zip(config.tests, rates, strict=True):
+        rows.append(
+            Row(
+                f"rate of harmonics per energy², elongation {a:g}, over that at {config.tests[0]:g}",
+                float(rate / rates[0]),
+            )
+        )
+    for i, a in enumerate(config.tests):
+        chains = data[f"chains_{i}"]
+        linear = 0.5 * abs(chains[:, :1].values - chains.values).sum(-1).mean(-1)
+        triads = 0.5 * abs(data[f"triads_energy_{i}"].values - chains.values).sum(-1).mean(-1)
+        for j, words in enumerate(config.pairs):
+            rows.append(
+                Row(
+                    f"total variation of triads, start {words}, elongation {a:g}",
+                    float(triads[j]),
+                    note=f"linear model {linear[j]:.3f}, {linear[j] / triads[j]:.1f} times as far; opened contacts {float(data[f'opened_{i}'][j]):.2g}",
+                )
+            )
+    slope, error = exponents(data)
+    rows.append(Row("exponent of the time to equipartition in the elongation", slope, error, note="three waves: -2"))
+    return rows
+
+
+def explain(data: xarray.Dataset, config: Config) -> str:
+    return (
+        "Couplings are fitted at each amplitude from starts in single bands and pairs of bands; held-out starts are predicted with those "
+        "of the middle amplitude. The linear chain, and with it every linear model, keeps the energy of each band of frequency for good."
+    )
+
+
+SCRIPT = harness.Script("harmonics", Config(), SMOKE, measure, draw, compare, explain)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    return harness.run(SCRIPT, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
