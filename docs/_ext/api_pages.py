@@ -43,10 +43,11 @@ TOPICS: dict[str, tuple[str, str]] = {
     ),
     "parts": ("Parts of a calibration", "master.*"),
     "theory": ("Theory", "theory.*"),
+    "mixing": ("Nonlinear contacts: energy that mixes bands", "mixing.*"),
     "frames": ("Frames of other codes", "read_frames Frames FramesWarning frames.*"),
     "networks": ("Networks: lattices and packings", "Network lattice packing network.*"),
 }
-ROOMS = ("chain", "energy", "ensemble", "frames", "master", "network", "theory")
+ROOMS = ("chain", "energy", "ensemble", "frames", "master", "mixing", "network", "theory")
 
 
 def public_names() -> dict[str, Any]:

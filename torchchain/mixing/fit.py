@@ -55,6 +55,13 @@ def fit_triads(*data: Mixing, bootstrap: int = 20) -> TriadFit:
 
     Raises:
         FieldError: for none or for different bands, fewer than 3 times, or too few realizations.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=32, boundary="fixed", n_bands=4, realizations=8)
+        >>> bands, times = tc.mixing.FrequencyBands(4), torch.linspace(0, 100, 9)
+        >>> weak, strong = (tc.mixing.measure_mixing(scene, a, bands, times=times) for a in (0.05, 0.1))
+        >>> tc.mixing.fit_triads(weak, strong, bootstrap=0).model.n_parameters
+        9
     """
     if not data:
         raise checks.fail("data", "be at least one measurement", "none")

@@ -188,6 +188,12 @@ def spectrum_and_shapes(scene: Scene, bands: FrequencyBands, realizations: int =
         scene: rings of linear or Hertz chains, whose linear modes are taken.
         bands: of frequency.
         realizations: chains to average over, at most those of the scene.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=32, n_bands=4, disorder=tc.Disorder(strength=0.0), realizations=1)
+        >>> spectrum, shapes = tc.mixing.spectrum_and_shapes(scene, tc.mixing.FrequencyBands(4, 2.0))
+        >>> spectrum.round(decimals=2).tolist()[0]  # tones 1 to 4 of the ordered ring
+        [0.5, 0.5, 0.0, 0.0]
     """
     checks.instance("scene", scene, Scene)
     if scene.lattice is not None:

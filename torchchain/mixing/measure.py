@@ -93,6 +93,13 @@ def measure_mixing(
 
     Raises:
         FieldError: for a scene of lattices or of damped chains, or a bad value.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=32, boundary="fixed", n_bands=4, realizations=4)
+        >>> one = torch.eye(4, dtype=torch.float64)[:1]
+        >>> data = tc.mixing.measure_mixing(scene, 0.05, tc.mixing.FrequencyBands(4), starts=one, times=[0.0, 100.0])
+        >>> 0 < 1 - float(data.mean[0, 1, 0] / data.mean[0, 0, 0]) < 0.1  # what has left band 1
+        True
     """
     checks.instance("scene", scene, Scene)
     if scene.lattice is not None:
@@ -155,6 +162,13 @@ def random_phases(
 
     Returns:
         State (realization, particle).
+
+    Example:
+        >>> chain = tc.Chain(tc.Disorder().masses(16, 1, 0), boundary="fixed")
+        >>> bands, energy = tc.mixing.FrequencyBands(4), torch.tensor([0.0, 0.01, 0.0, 0.0], dtype=torch.float64)
+        >>> state = tc.mixing.random_phases(chain, tc.normal_modes(chain), bands, energy, keys=[(0, 0, 0)])
+        >>> round(float(chain.energy(state.displacement, state.velocity)), 6)
+        0.16
     """
     members = bands.members(modes.frequencies)
     share = members / members.sum(-2, keepdim=True).clamp(min=1)
