@@ -14,6 +14,7 @@ from torchchain.energy.space import (
     potential_energy,
     total_energy,
 )
+from torchchain.energy.start_energy import StartEnergy, excited, start_energy
 from torchchain.energy.wavenumber import (
     band_energy,
     basis_fraction,
@@ -24,8 +25,8 @@ from torchchain.energy.wavenumber import (
 )
 
 __all__ = [
-    "DEFINITIONS", "EnergyMatrices", "band_energy", "band_of", "basis_fraction", "bin_energy", "center_tones",
-    "check_bands", "energy_center", "energy_matrices", "energy_width", "kicked", "kicked_band_energy", "kinetic_energy", "long_time_band_energy",
-    "modal_band_energy", "particle_energy", "potential_energy", "total_energy", "wavenumber_energy",
+    "DEFINITIONS", "EnergyMatrices", "StartEnergy", "band_energy", "band_of", "basis_fraction", "bin_energy", "center_tones",
+    "check_bands", "energy_center", "energy_matrices", "energy_width", "excited", "kicked", "kicked_band_energy", "kinetic_energy", "long_time_band_energy",
+    "modal_band_energy", "particle_energy", "potential_energy", "start_energy", "total_energy", "wavenumber_energy",
     "wavenumber_energy_matrix", "zero_wavenumber_share",
 ]  # fmt: skip
