@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchchain as tc
-from torchchain import plots
 from torchchain.ensemble.fused import band_energy
 from torchchain.ensemble.scene import regular_times
 

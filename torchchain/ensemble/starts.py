@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ class StartTransfer:
 
     def __post_init__(self) -> None:
         tones = tuple(checks.integer("starts.tones", tone, 1) for tone in self.tones)
-        if not tones or any(b <= a for a, b in zip(tones, tones[1:], strict=False)):
+        if not tones or any(b <= a for a, b in pairwise(tones)):
             raise checks.fail("starts.tones", "increase", tones)
         object.__setattr__(self, "tones", tones)
         object.__setattr__(self, "samples", checks.integer("starts.samples", self.samples, 1))
@@ -111,9 +112,9 @@ class StartTransfer:
             return torch.from_numpy(values.astype(np.float64))
 
         tones = tuple(checks.integer("data.start_tone", tone, 1) for tone in np.atleast_1d(data["start_tone"].values))
-        names = ("start_time", "released", "released_stderr", "kicked", "kicked_stderr")
+        names = ("released", "released_stderr", "kicked", "kicked_stderr")
         samples = checks.integer("data.start_samples", data["start_samples"].values.tolist() if "start_samples" in data else 0, 1)
-        return cls(tones, *(tensor(name) for name in names), samples)
+        return cls(tones, tensor("start_time"), samples=samples, **{name: tensor(name) for name in names})
 
 
 def start_tones(scene: Scene) -> tuple[int, ...]:
@@ -157,11 +158,11 @@ def start_transfer(
         excitation=replace(scene.excitation, tones=start_tones(scene), phase="cos"),  # the sine of tone N/2 is none
     )  # fmt: skip
     moments = ensemble_moments(other, method, 1, options=options, checkpoint=checkpoint, **settings).moments
-    found = []
-    for name in other.observables:
+    found: dict[str, Tensor] = {}
+    for kind, name in zip(KINDS, other.observables, strict=True):
         total = merged(moments.blocks(name))
-        found += _rounded(total.mean, ordered_error(scene.is_ordered, total))
-    return StartTransfer(start_tones(scene), other.times, *found, half // scene.sample_size)
+        found[kind], found[f"{kind}_stderr"] = _rounded(total.mean, ordered_error(scene.is_ordered, total))
+    return StartTransfer(start_tones(scene), other.times, samples=half // scene.sample_size, **found)
 
 
 def _rounded(mean: Tensor, stderr: Tensor) -> tuple[Tensor, Tensor]:

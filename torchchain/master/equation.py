@@ -191,9 +191,9 @@ class MasterEquation(Printed, nn.Module):
         times = checks.times("times", times).to(self.rates)
         start = self._start(initial)
         if start is not None and self.starts is not None:
-            for field, usual, value in (("method", "expm", method), ("supply", None, supply)):
-                if value is not usual and value != usual:
-                    raise checks.fail(field, f"be {usual} for a start in space", checks.shown(value))
+            checks.choice("method for a start in space", method, ("expm",))
+            if supply is not None:
+                raise checks.fail("supply", "be None for a start in space", checks.shown(supply))
             with single_thread():
                 energy = self.starts.solve(start, times).to(self.rates)
             self._warn(start.bands(self.n_bands).to(self.rates), times, None, energy.detach())

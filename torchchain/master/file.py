@@ -70,8 +70,8 @@ def save_family(members: Sequence[Member], path: str | Path) -> None:
     headers = [_described(model, record) for model, record, *_ in members]
     tensors = {
         f"{i}.{name}": value
-        for i, (model, _, *rest) in enumerate(members)
-        for name, value in _packed(model, *rest).items()
+        for i, (model, _, uncertainty, starts) in enumerate(members)
+        for name, value in _packed(model, uncertainty, starts).items()
     }
     _write({"format": FAMILY_FORMAT, "format_version": FORMAT_VERSION, "members": headers}, tensors, path)
 

@@ -35,8 +35,8 @@ def starts(master: MasterEquation, scene: Scene) -> Tensor | StartEnergy:
     if master.starts is not None:
         wave = scene.excitation
         found = excited(replace(wave, tones=scene.tones) if isinstance(wave, StandingWave) else wave, scene.n_particles)
-        parts = (x / found.total[..., None] for x in (found.potential, found.kinetic, found.virial))
-        return StartEnergy(*parts, found.rigid / found.total)
+        size = found.total[..., None]
+        return StartEnergy(found.potential / size, found.kinetic / size, found.virial / size, found.rigid / found.total)
     return torch.eye(master.n_bands, dtype=torch.float64)[[band - 1 for band in scene.source_bands]]
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -22,11 +22,11 @@ from torch import Tensor, nn
 
 from torchchain import checks
 from torchchain.energy.start_energy import StartEnergy
-from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.starts import KINDS
 from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master.compact import BEYOND, checked_degrees, chosen_times, n_coefficients, solve
+from torchchain.master.compact import checked_degrees, n_coefficients
+from torchchain.master.logistic import BEYOND, chosen_times, solve
 from torchchain.master.misfit import model_error
 from torchchain.master.tones import ToneRegression, Tones, shares
 from torchchain.master.uncertainty import Uncertainty
@@ -57,7 +57,7 @@ class StartModel(nn.Module):
             (start_time,) and (kind, start_time); no times if unknown.
     """
 
-    AXES = {
+    AXES: ClassVar[dict[str, tuple[str, ...]]] = {
         "degrees": ("degree",), "released": ("term",), "kicked": ("term",), "frequency": ("start_tone",), "decay": ("start_tone",),
         "coupling": (), "scale_times": ("start_time",), "scale": ("kind", "start_time"),
     }  # fmt: skip
@@ -114,7 +114,7 @@ class StartModel(nn.Module):
 
     @property
     def _tones(self) -> Tones:
-        return Tones(*(self.get_buffer(name) for name in ("frequency", "decay", "coupling")), self.n_bands)
+        return Tones(**{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling")}, n_bands=self.n_bands)
 
     def transfer(self, kind: str, tones: Any, times: Tensor) -> Tensor:
         """T [tone, time, receiver] of some tones, counted from 1.
@@ -195,7 +195,8 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
     kinds are held to it: what kicks then differ by is taken from the last time.
     """
     scene, starts = transfer.scene, transfer.starts
-    assert scene is not None and starts is not None, "can_fit has said so"
+    assert scene is not None, "can_fit has said so"
+    assert starts is not None, "and so"
     other = scene.stiffness_disorder
     strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
     tones = Tones.of(scene.n_particles, scene.n_bands, strength)
@@ -206,7 +207,7 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
     picked = chosen_times(transfer.times)
     whole = transfer.times[picked], transfer.mean[:, picked].double(), transfer.stderr[:, picked].double()
     late = transfer.long_time if len(picked) else None
-    coefficients = []
+    coefficients: dict[str, Tensor] = {}
     with single_blas_thread():
         for kind in KINDS:
             mean, stderr = getattr(starts, kind)[:, later], getattr(starts, f"{kind}_stderr")[:, later]
@@ -219,19 +220,19 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
                     end = (end + mean[center, -1] - starts.released[center, -1]).clamp(min=0)
                     end, error = end / end.sum(-1, keepdim=True), stderr[center, -1:]
                 beyond = transfer.times.new_tensor([*BEYOND, math.inf])
-                far = [x.expand(-1, len(beyond), -1) for x in (end[:, None], error)]
-                told.append((own, transfer.times[-1] * beyond, *far))
+                shape = (-1, len(beyond), -1)
+                told.append((own, transfer.times[-1] * beyond, end[:, None].expand(shape), error.expand(shape)))
             problems = [
                 ToneRegression(tones, kind, degrees, which, times, data, _weights(error))
                 for which, times, data, error in told
                 if len(which)
             ]
             found, _ = solve(problems, np.ones((len(problems), 1)))
-            coefficients.append(torch.from_numpy(found[0]))
+            coefficients[kind] = torch.from_numpy(found[0])
     none = torch.zeros(0, dtype=torch.float64)
     return StartModel(
-        torch.tensor(degrees, dtype=torch.float64), *coefficients, tones.frequency, tones.decay, tones.coupling,
-        none, none.expand(2, 0), scene.n_bands,
+        torch.tensor(degrees, dtype=torch.float64), **coefficients, frequency=tones.frequency, decay=tones.decay,
+        coupling=tones.coupling, scale_times=none, scale=none.expand(2, 0), n_bands=scene.n_bands,
     )  # fmt: skip
 
 
@@ -249,7 +250,8 @@ def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertai
     Where it was fitted to fewer samples they are larger, and where it misses its data by more than their noise explains.
     """
     starts, scene = transfer.starts, transfer.scene
-    assert starts is not None and scene is not None, "the model was fitted to them"
+    assert starts is not None, "the model was fitted to them"
+    assert scene is not None, "and of these chains"
     times, width = starts.times[1:], scene.n_particles // 2 // scene.n_bands
     base = uncertainty.of(torch.eye(scene.n_bands, dtype=torch.float64), times)
     numbers = torch.tensor(starts.tones) - 1

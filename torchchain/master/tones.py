@@ -11,7 +11,6 @@ D is second-order perturbation theory: with h the response to a beat and c the v
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,9 +19,9 @@ import torch
 from torch import Tensor
 
 from torchchain.ensemble.starts import KINDS
-from torchchain.master.compact import (
-    FLOOR, LARGEST_EXPONENT, RIDGE, SERIES, WIDTH, _clock, _early, _poles, _polynomials, _response, terms,
-)  # fmt: skip
+from torchchain.master.compact import LARGEST_EXPONENT, clock_of, polynomials, terms
+from torchchain.master.logistic import RIDGE
+from torchchain.master.waves import WIDTH, poles, scattered
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class Tones:
     def of(cls, n_particles: int, n_bands: int, strength: float) -> Tones:
         """Those of rings whose masses have a standard deviation, in the self-consistent Born approximation."""
         tones = np.arange(1, n_particles // 2 + 1)
-        z = _poles(2 * np.sin(np.pi / n_particles * tones), strength)
+        z = poles(2 * np.sin(np.pi / n_particles * tones), strength)
         coupling = torch.tensor(strength**2 / n_particles, dtype=torch.float64)
         return cls(torch.from_numpy(z.real.copy()), torch.from_numpy(-WIDTH * z.imag), coupling, n_bands)
 
@@ -69,28 +68,10 @@ class Tones:
             times: (time,).
         """
         w, g = self.frequency[numbers][:, None, None], self.decay[numbers][:, None, None]
-        other, rate = self.frequency[:, None], g + self.decay[:, None]
-        slow, fast, finite = (w - other).abs(), w + other, times.isfinite()
-        t = torch.where(finite, times, torch.zeros_like(times))
-        settled = 1 / (slow**2 + rate**2), 1 / (fast**2 + rate**2)
-        near, far = (
-            torch.where(finite, _response(x, rate, t), late)
-            for x, late in zip((slow, fast), settled, strict=True)
-        )  # fmt: skip
-        # Where waves have beaten to rest, others have come: a share of the envelope stays.
-        squared = t**2
-        if kind == KINDS[0]:
-            size = w * other
-            beat = torch.where(finite & (t < SERIES), _early(slow, fast, rate, t.clamp(max=SERIES)), near - far)
-            rise = squared**2 * size / 6 / ((1 + squared * fast**2 / 12) * (1 + squared / settled[0] / 2))
-            ending = 4 * size * settled[0] / fast**2
-        else:
-            size = w * w
-            beat, rise, ending = near + far, squared / (1 + squared / settled[0] / 2), settled[0] + settled[1]
-        least = FLOOR * torch.where(finite, rise, ending)
-        each = self.coupling * size * (beat + (beat**2 + 4 * least**2).sqrt()) / 2
-        each = each * (torch.arange(len(self), device=t.device)[:, None] != numbers[:, None, None])
-        return each.reshape(len(numbers), self.n_bands, self.width, len(t)).sum(2).transpose(1, 2)
+        rate = g + self.decay[:, None]
+        each = self.coupling * scattered(w, self.frequency[:, None], rate, times, kind == KINDS[1])
+        each = each * (torch.arange(len(self), device=times.device)[:, None] != numbers[:, None, None])
+        return each.reshape(len(numbers), self.n_bands, self.width, len(times)).sum(2).transpose(1, 2)
 
     def shapes(self, numbers: Tensor, degrees: Sequence[int]) -> Tensor:
         """Polynomials of place and distance, (source, slot, term): slots are the bands, and last the source's own tone."""
@@ -101,7 +82,7 @@ class Tones:
         distance = ((self._distance(numbers) - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
         middle = (place[numbers][:, None] + place.reshape(self.n_bands, -1).mean(1)) / 2
         u, v, own = (
-            _polynomials(x, degree)
+            polynomials(x, degree)
             for x, degree in ((middle, degrees[0]), (distance, degrees[1]), (place[numbers], degrees[0]))
         )
         p, _ = terms(degrees)
@@ -138,7 +119,7 @@ def shares(
     """T (source, time, band) of some sources: odds over their sum, never negative."""
     index = torch.from_numpy(held(degrees)).to(coefficients.device)
     table = coefficients.new_zeros(index.shape).masked_scatter(index, coefficients)
-    exponent = torch.einsum("srp,pt->str", tones.shapes(numbers, degrees), table @ _polynomials(_clock(times), degrees[2]).T)
+    exponent = torch.einsum("srp,pt->str", tones.shapes(numbers, degrees), table @ polynomials(clock_of(times), degrees[2]).T)
     moved = exponent.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).exp()
     moved = torch.cat([tones.odds(kind, numbers, times) * moved[..., :-1], moved[..., -1:]], -1)
     moved = moved / moved.sum(-1, keepdim=True)
@@ -161,7 +142,7 @@ class ToneRegression:
         odds = tones.odds(kind, numbers, times)
         self.odds = torch.cat([odds, torch.ones_like(odds[..., :1])], -1).numpy()
         self.shape = tones.shapes(numbers, degrees).numpy()
-        self.clock = _polynomials(_clock(times), degrees[2]).numpy()
+        self.clock = polynomials(clock_of(times), degrees[2]).numpy()
         self.held, self.data, self.weight = held(degrees), data.numpy(), weight.numpy()
         self.own = np.arange(len(numbers)), tones.band(numbers).numpy()
 
