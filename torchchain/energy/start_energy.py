@@ -121,7 +121,21 @@ def _ratio(part: Tensor, whole: Tensor) -> Tensor:
 
 
 def excited(excitation: Any, n_particles: int, dtype: torch.dtype = torch.float64) -> StartEnergy:
-    """The energies of an :class:`torchchain.Impulse` or of the waves of a :class:`torchchain.StandingWave`, with an axis of tones."""
+    """The energies of an :class:`torchchain.Impulse` or of the waves of a :class:`torchchain.StandingWave`, with an axis of tones.
+
+    Args:
+        excitation: its tones given.
+        n_particles: N, of the ring.
+        dtype: of the energies.
+
+    Raises:
+        FieldError: for a site or tone that the ring has not.
+
+    Example:
+        >>> start = tc.energy.excited(tc.StandingWave(tones=(3, 5)), 64)
+        >>> tuple(start.potential.shape)
+        (2, 32)
+    """
     checks.integer("n_particles", n_particles, 2)
     excitation.check(n_particles)
     chain = Chain(torch.ones(n_particles, dtype=dtype))
