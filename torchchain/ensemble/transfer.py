@@ -33,9 +33,9 @@ from torchchain.ensemble.ranks import ALONE, Ranks
 from torchchain.ensemble.run import ensemble_moments
 from torchchain.ensemble.scene import Scene, describe
 from torchchain.ensemble.stages import Stages
-from torchchain.ensemble.starts import StartTransfer, measurable, start_transfer
 from torchchain.ensemble.statistics import EnsembleMoments, Moments, merged
 from torchchain.network import Network
+from torchchain.theory.lattices import lattice_transfer
 from torchchain.theory.law import law_of
 from torchchain.theory.transfer import theory_transfer
 from torchchain.threads import single_thread
@@ -97,7 +97,6 @@ class BandTransfer(Printed):
         provenance: where it comes from; of a simulation, left out, its scene.
         systematic: of a transfer from theory, estimated total variation distance from an endless ensemble, [source, time];
             else None.
-        starts: the transfer from other tones of each band and from kicks; None where it was not measured.
 
     Example:
         >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=20, times=[0.0, 5.0, 50.0])
@@ -120,13 +119,11 @@ class BandTransfer(Printed):
     attributes: dict[str, Any] = field(default_factory=dict)
     provenance: Provenance | None = None
     systematic: Tensor | None = None
-    starts: StartTransfer | None = None
 
     def __post_init__(self) -> None:
         checks.instance("scene", self.scene, Scene, type(None))
         checks.instance("attributes", self.attributes, dict)
         checks.instance("provenance", self.provenance, Provenance, type(None))
-        checks.instance("starts", self.starts, StartTransfer, type(None))
         if self.provenance is None:
             origin = Provenance()
             if self.scene is not None:
@@ -159,8 +156,6 @@ class BandTransfer(Printed):
                 checks.first_bad(name, "not be negative", value, ~(value >= 0), "band")
             else:
                 checks.real_tensor(name, value)
-        if self.starts is not None and self.starts.released.shape[-1] != n:
-            raise checks.fail("starts", f"have {n} receivers", self.starts.released.shape[-1])
 
     @property
     def n_bands(self) -> int:
@@ -192,7 +187,6 @@ class BandTransfer(Printed):
             "samples": f"{sum(self.block_counts)} in {len(self.block_counts)} blocks",
             "mean": f"standard error up to {self.stderr.max():.1e}",
             "long_time": known,
-            **({"starts": f"{len(self.starts.tones)} tones released and kicked, {self.starts.samples} samples"} if self.starts else {}),
             **method,
         }
 
@@ -261,8 +255,6 @@ class BandTransfer(Printed):
             put("block_long_time", (b, s, r), self.block_long_time, "block means")
         if self.systematic is not None:
             put("systematic", (s, t), self.systematic, "estimated total variation distance from an endless ensemble")
-        if self.starts is not None:
-            variables |= self.starts.variables()
         bands = np.arange(1, self.n_bands + 1)
         coords = {
             **time_coordinates(self.times, self.scene.si if self.scene is not None else None),
@@ -326,7 +318,6 @@ class BandTransfer(Printed):
             attributes,
             _provenance_of(data),
             tensor("systematic") if "systematic" in data else None,
-            StartTransfer.from_dataset(data),
         )
 
     def save(self, path: str | Path) -> None:
@@ -625,7 +616,6 @@ def band_transfer(
     options: dict[str, Any] | None = None,
     checkpoint: Checkpoint | str | Path | None = None,
     ranks: Ranks = ALONE,
-    starts: bool = True,
 ) -> BandTransfer:
     """The transfer of energy from every band to every band: one standing wave per band, averaged over the ensemble.
 
@@ -634,14 +624,13 @@ def band_transfer(
     Args:
         scene: standing waves with one tone in each of its bands, or none given (the bands' center tones).
         method: a name of ``evolvers.METHODS``; "auto" for the plan's choice; or "theory" for band energies without chains
-            (see :func:`torchchain.theory.theory_transfer`): no statistical error, ``systematic`` as its own estimate.
+            (see :func:`torchchain.theory.theory_transfer`): no statistical error, ``systematic`` as its own estimate; of
+            scalar lattices (:func:`torchchain.theory.lattice_transfer`) without that and without a long-time average.
         long_time: also take the exact infinite-time average from the modes; damped chains have none. Of lattices with more
             than 1500 unknowns it is the mean over the later half of the times, whose error counts what has not settled.
         device, memory_budget, progress, stages, options: see :func:`stream`.
         checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
         ranks: processes that share the realizations, from :func:`torchchain.ranks.process_group`; each gets the result.
-        starts: also measure the transfer from other tones of each band and from kicks, of undamped, linear rings with 16 samples
-            and more: a model calibrated on it takes any start in space. It adds about a third to the cost.
 
     Returns:
         BandTransfer with mean and stderr [source, time, receiver].
@@ -656,7 +645,6 @@ def band_transfer(
         [True, True]
     """
     checks.truth("long_time", long_time)
-    checks.truth("starts", starts)
     scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
     if isinstance(method, str) and method == THEORY:
         checks.known_keys("options of method 'theory'", options or {}, ())
@@ -664,22 +652,14 @@ def band_transfer(
             return _from_theory(scene, long_time and scene.damping == 0)
     long_time = long_time and scene.damping == 0
     observables = measured_observables(scene, long_time)
-    settings: dict[str, Any] = {
-        "device": device, "memory_budget": memory_budget, "progress": progress, "stages": stages, "ranks": ranks,
-    }  # fmt: skip
-    if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
-        checkpoint = Checkpoint(checkpoint)
     ensemble = ensemble_moments(
         replace(scene, observables=observables), method,
-        min(BLOCKS, scene.distinct_realizations // scene.sample_size), options=options, checkpoint=checkpoint, **settings,
+        min(BLOCKS, scene.distinct_realizations // scene.sample_size), device=device, memory_budget=memory_budget,
+        progress=progress, stages=stages, options=options, checkpoint=checkpoint, ranks=ranks,
     )  # fmt: skip
     with single_thread(), stages("statistics"):
         found = _from_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None)
-        found = with_late_average(found) if long_time and len(observables) == 1 else found
-    if not starts or not measurable(scene):
-        return found
-    other = None if checkpoint is None else Checkpoint(checkpoint.folder / "starts", checkpoint.every)
-    return replace(found, starts=start_transfer(scene, ensemble.method, ensemble.options, other, **settings))
+        return with_late_average(found) if long_time and len(observables) == 1 else found
 
 
 def measured_observables(scene: Scene, long_time: bool = True) -> tuple[str, ...]:
@@ -708,21 +688,40 @@ def with_late_average(transfer: BandTransfer) -> BandTransfer:
 def _from_theory(scene: Scene, long_time: bool) -> BandTransfer:
     """The transfer of the scene's law of disorder, without chains; its realizations do not matter."""
     if scene.lattice is not None:
-        raise checks.fail("method", "not be 'theory' for lattices", repr(THEORY))
+        return _from_lattice_theory(scene)
     if scene.energy_definition != "site":
         raise checks.fail("energy_definition", "be 'site' for method 'theory'", repr(scene.energy_definition))
     found = theory_transfer(
         scene.disorder, scene.n_particles, scene.n_bands, scene.times, scene.tones, scene.boundary,
         scene.stiffness_disorder, scene.contact, scene.damping,
     )  # fmt: skip
-    law, late = law_of(scene.disorder), found.long_time if long_time else None
+    return _of_law(scene, found.mean, found.long_time if long_time else None, found.systematic)
+
+
+def _from_lattice_theory(scene: Scene) -> BandTransfer:
+    """The same of scalar lattices, without a long-time average and an estimate of what the ladder misses."""
+    for name, wanted in (("motion", "scalar"), ("boundary", "periodic"), ("damping", 0.0), ("removed_bonds", 0.0)):
+        value = getattr(scene, name)
+        if value != wanted:
+            raise checks.fail(name, f"be {wanted!r} for method 'theory' of lattices", repr(value))
+    if scene.stiffness_disorder is not None and scene.stiffness_disorder.strength > 0:
+        raise checks.fail("stiffness_disorder", "be None for method 'theory' of lattices", scene.stiffness_disorder)
+    assert scene.lattice is not None
+    assert scene.shape is not None
+    mean = lattice_transfer(scene.disorder, scene.lattice, scene.shape, scene.n_bands, scene.times, scene.tones)
+    return _of_law(scene, mean, None, None)
+
+
+def _of_law(scene: Scene, mean: Tensor, late: Tensor | None, systematic: Tensor | None) -> BandTransfer:
+    """A transfer without statistical error."""
+    law = law_of(scene.disorder)
     attributes = {
         "method": THEORY, "method_options": "{}", "mass_mean": law.mean, "mass_sd": max(0.0, law.variance) ** 0.5,
     }  # fmt: skip
     return BandTransfer(
-        scene, scene.times, found.mean, torch.zeros_like(found.mean), late,
-        None if late is None else torch.zeros_like(late), found.mean[None], None if late is None else late[None], (1,),
-        attributes, Provenance("theory", describe(scene)), found.systematic,
+        scene, scene.times, mean, torch.zeros_like(mean), late, None if late is None else torch.zeros_like(late),
+        mean[None], None if late is None else late[None], (1,), attributes, Provenance("theory", describe(scene)),
+        systematic,
     )  # fmt: skip
 
 

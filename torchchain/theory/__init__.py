@@ -1,6 +1,7 @@
 """Band energies from the theory of disorder, without chains (docs/theory.md)."""
 
 from torchchain.theory.fit import DisorderFit, fit_disorder
+from torchchain.theory.lattices import lattice_transfer
 from torchchain.theory.law import Law, law_of
 from torchchain.theory.localized import MEASURED, Return
 from torchchain.theory.medium import EffectiveMedium, born_rates, effective_medium
@@ -16,6 +17,7 @@ __all__ = [
     "born_rates",
     "effective_medium",
     "fit_disorder",
+    "lattice_transfer",
     "law_of",
     "theory_transfer",
 ]

@@ -25,7 +25,7 @@ from scipy import special
 from torch import Tensor
 
 from torchchain.theory.law import Law
-from torchchain.theory.medium import coherent_mass, site_resolvent
+from torchchain.theory.medium import Levels, coherent_mass, site_resolvent
 
 FIRST, RATIO = 4.0, 10.0  # end of the first stretch of times, and how many times longer each next is
 DECAY = 9.0  # eta times the period of the time grid: exp(-2 DECAY) = 1.5e-8 of a period's energy comes back
@@ -58,6 +58,11 @@ class Waves:
     damping: float = 0.0
 
     @property
+    def ring(self) -> int | Levels:
+        """What the site resolvent is summed over."""
+        return self.n_particles
+
+    @property
     def tone_squares(self) -> Tensor:
         """w_q^2 of tones 1 to N/2, (tone,)."""
         n = self.n_particles
@@ -69,6 +74,18 @@ class Waves:
         weight = torch.full((self.n_particles // 2,), 2.0, dtype=torch.float64)
         weight[-1] = 1.0
         return weight
+
+    def received(self, argument: Tensor) -> Tensor:
+        """(1/N) sum over a band of w_q^2 / (w_q^2 - e), [band, frequency]; tones one block at a time."""
+        n, bands = self.n_particles, self.n_bands
+        squares = self.tone_squares.reshape(bands, -1)
+        weights = (self.tone_weights / n).reshape(bands, -1)
+        found = torch.zeros(bands, len(argument), dtype=argument.dtype)
+        size = max(1, 2**21 // (bands * len(argument)))
+        for block in range(0, squares.shape[1], size):
+            part, weight = squares[:, block : block + size, None], weights[:, block : block + size, None]
+            found += (weight * part / (part - argument)).sum(1)
+        return found
 
 
 @dataclass(frozen=True)
@@ -134,10 +151,10 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
     z = torch.complex(right, torch.full_like(right, stretch.eta))
     loss = 1 - 1j * waves.damping * z  # contact damping: K -> (1 - i damping z) K
     inner = z / loss.sqrt()
-    mass, _ = coherent_mass(inner, law, waves.n_particles)
+    mass, _ = coherent_mass(inner, law, waves.ring)
     argument = inner.square() * mass
-    g = site_resolvent(argument, waves.n_particles)
-    received = _received(waves, argument)
+    g = site_resolvent(argument, waves.ring)
+    received = waves.received(argument)
     source = 1 / (waves.sources[:, None] - argument)
     window = _window(z, stretch)
     z, inner = _mirrored(z, -1), _mirrored(inner, -1)
@@ -209,19 +226,6 @@ def _window(z: Tensor, stretch: Stretch) -> Tensor:
     return torch.from_numpy(
         (special.erf((at + stretch.cut) / stretch.smooth) - special.erf((at - stretch.cut) / stretch.smooth)) / 2
     )
-
-
-def _received(waves: Waves, argument: Tensor) -> Tensor:
-    """(1/N) sum over a band of w_q^2 / (w_q^2 - e), [band, frequency]; tones one block at a time."""
-    n, bands = waves.n_particles, waves.n_bands
-    squares = waves.tone_squares.reshape(bands, -1)
-    weights = (waves.tone_weights / n).reshape(bands, -1)
-    found = torch.zeros(bands, len(argument), dtype=argument.dtype)
-    size = max(1, 2**21 // (bands * len(argument)))
-    for block in range(0, squares.shape[1], size):
-        part, weight = squares[:, block : block + size, None], weights[:, block : block + size, None]
-        found += (weight * part / (part - argument)).sum(1)
-    return found
 
 
 def _coherent(

@@ -26,6 +26,26 @@ _ABOVE_THE_AXIS = 1e-7  # a real frequency is taken as its limit from above
 
 
 @dataclass(frozen=True, eq=False)
+class Levels:
+    """Squared frequencies of an ordered lattice of one displacement per particle, which stand for its wavevectors.
+
+    Attributes:
+        squares: w_q^2, each once, (level,).
+        weights: share of the wavevectors at each, (level,).
+
+    Example:
+        >>> from torchchain.theory.medium import Levels, site_resolvent
+        >>> ring = Levels(torch.tensor([0.0, 2.0, 4.0], dtype=torch.float64), torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64))
+        >>> at = torch.tensor([1.0 + 0.5j], dtype=torch.complex128)
+        >>> torch.allclose(site_resolvent(at, ring), site_resolvent(at, 4))  # a chain of four
+        True
+    """
+
+    squares: Tensor
+    weights: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class EffectiveMedium:
     """Mean properties of waves of each frequency, every tensor (frequency,).
 
@@ -127,7 +147,7 @@ def born_rates(strength: float, wavenumbers: Any) -> Tensor:
 
 
 def coherent_mass(
-    z: Tensor, law: Law, n_particles: int | None = None, start: Tensor | None = None, tolerance: float = 1e-11
+    z: Tensor, law: Law, n_particles: int | Levels | None = None, start: Tensor | None = None, tolerance: float = 1e-11
 ) -> tuple[Tensor, float]:
     """mu(z) for complex frequencies with Re z > 0 and Im z > 0, (frequency,), and the largest residual.
 
@@ -168,12 +188,16 @@ def coherent_mass(
     return mass, float(residual.max())
 
 
-def site_resolvent(argument: Tensor, n_particles: int | None = None) -> Tensor:
-    """g(e) = (1/N) sum_q 1 / (4 sin^2(q/2) - e) for complex e; the infinite chain's 1 / sqrt(e (e - 4)) for None."""
+def site_resolvent(argument: Tensor, n_particles: int | Levels | None = None) -> Tensor:
+    """g(e) = (1/N) sum_q 1 / (w_q^2 - e) for complex e, of a ring of N, w_q = 2 sin(q/2), or the levels of another lattice;
+    the infinite chain's 1 / sqrt(e (e - 4)) for None."""
     return _resolvent_and_slope(argument, n_particles)[0]
 
 
-def _resolvent_and_slope(e: Tensor, n_particles: int | None) -> tuple[Tensor, Tensor]:
+def _resolvent_and_slope(e: Tensor, n_particles: int | Levels | None) -> tuple[Tensor, Tensor]:
+    if isinstance(n_particles, Levels):
+        inverse, weights = 1 / (n_particles.squares - e[..., None]), n_particles.weights.to(e)
+        return inverse @ weights, inverse.square() @ weights
     g = -1 / (e * torch.sqrt(1 - 4 / e))
     slope = -(e - 2) / (e * (e - 4)) * g
     if n_particles is None:
