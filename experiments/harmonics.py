@@ -199,9 +199,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     for i, a in enumerate(config.amplitudes):
         ax.plot(data.late, data.distance[i, 0], label=f"elongation {a:g}")
     ax.plot(data.late, data.distance_model, "k--", label="triads")
-    ax.set(
-        xlabel="time $\\times$ elongation$^2$", ylabel="distance from equipartition", title="(e) way to equipartition"
-    )
+    ax.set(xlabel="time $\\times$ elongation$^2$", ylabel="distance from equipartition", title="(e) way to equipartition")
     ax.legend(fontsize="small")
     ax = axes[1, 2]
     times = equipartition_times(data)

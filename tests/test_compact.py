@@ -109,7 +109,7 @@ def test_series_and_closed_form_meet():
 
 def test_born_decay_in_weak_disorder():
     frequency = 2 * np.sin(np.linspace(0.3, 2.2, 9) / 2)
-    poles = waves._poles(frequency, 0.02)
+    poles = waves.poles(frequency, 0.02)
     born = 0.02**2 * np.sin(np.linspace(0.3, 2.2, 9) / 2) * np.tan(np.linspace(0.3, 2.2, 9) / 2)
     np.testing.assert_allclose(-poles.imag, born, rtol=5e-3)
 

@@ -360,13 +360,7 @@ def written(columns, path, text=""):
         text += f"ITEM: TIME\n{frame.time:.17g}\nITEM: TIMESTEP\n{frame.step}\nITEM: NUMBER OF ATOMS\n12\n"
         text += f"ITEM: BOX BOUNDS pp pp pp\n0 12\n-2 2\n-2 2\nITEM: ATOMS {columns}\n"
         for i in range(12):
-            known = {
-                "id": i + 1,
-                "type": 1 + i % 2,
-                "radius": 0.5,
-                "xu": frame.positions[i, 0],
-                "vx": frame.velocities[i, 0],
-            }
+            known = {"id": i + 1, "type": 1 + i % 2, "radius": 0.5, "xu": frame.positions[i, 0], "vx": frame.velocities[i, 0]}
             text += " ".join(f"{float(known[name]):.17g}" for name in columns.split()) + "\n"
     path.write_text(text)
 

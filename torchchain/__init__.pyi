@@ -27,6 +27,7 @@ from torchchain.energy import energy_center as energy_center
 from torchchain.energy import energy_matrices as energy_matrices
 from torchchain.energy import energy_width as energy_width
 from torchchain.energy import potential_energy as potential_energy
+from torchchain.energy import start_energy as start_energy
 from torchchain.energy import wavenumber_energy_matrix as wavenumber_energy_matrix
 from torchchain.energy import zero_wavenumber_share as zero_wavenumber_share
 from torchchain.ensemble import BandTransfer as BandTransfer

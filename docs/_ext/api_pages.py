@@ -22,7 +22,7 @@ TOPICS: dict[str, tuple[str, str]] = {
         "particle_energy kinetic_energy potential_energy total_energy bond_energy energy_matrices EnergyMatrices energy_center "
         "energy_width energy_moments wavenumber_energy wavenumber_energy_matrix zero_wavenumber_share band_energy "
         "bin_energy long_time_band_energy basis_fraction energy.band_of energy.center_tones energy.check_bands "
-        "energy.modal_band_energy energy.DEFINITIONS energy.band_energy energy.kinetic_energy energy.long_time_band_energy "
+        "start_energy energy.StartEnergy energy.excited energy.kicked energy.kicked_band_energy energy.modal_band_energy energy.DEFINITIONS energy.band_energy energy.kinetic_energy energy.long_time_band_energy "
         "energy.particle_energy energy.total_energy energy.wavenumber_energy",
     ),
     "localization": (

@@ -183,6 +183,8 @@ class Predict:
     """bands that start with a unit energy, a run of its own each"""
     initial: Annotated[tuple[float, ...] | None, flag("FLOAT ...")] = None
     """energy of every band at the start, in place of --source"""
+    excitation: ExcitationFlags = field(default_factory=ExcitationFlags)
+    """a start in space, in place of --source; a config file may also hold displacement and velocity under [state]"""
     times: TimesFlags = field(default_factory=TimesFlags)
     method: Annotated[str, flag(choices.SOLVERS, "expm")] = "expm"
     """matrix exponential, or a method of torchdiffeq"""
@@ -201,7 +203,7 @@ class Predict:
 
     def overrides(self) -> dict[str, Any]:
         """The flags of the request that were given, as nested plain values."""
-        return {k: v for k, v in given(self).items() if k in ("strength", "source", "initial", "times")}
+        return {k: v for k, v in given(self).items() if k in ("strength", "source", "initial", "times", "excitation")}
 
 
 @dataclass(frozen=True)

@@ -118,9 +118,7 @@ def _each_doubt_once() -> Iterator[None]:
 
 def _config(flags: Import, files: list[RunFiles]) -> str:
     """The flags as TOML, by which the import can be made again from any folder."""
-    given = {
-        name: value for name, value in vars(flags).items() if value is not None and name not in ("out", "calibrate")
-    }
+    given = {name: value for name, value in vars(flags).items() if value is not None and name not in ("out", "calibrate")}
     for name in ("reference", "contacts", "masses"):
         place = Path(given.get(name, ""))
         if place.parent != Path() or (name == "masses" and place.is_file()):
@@ -296,7 +294,9 @@ def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Ch
         return frames, grains
     chains = []
     for run, each in zip(files, frames, strict=True):
-        chains.append(each.chain(flags.boundary, stiffness, axis=flags.axis, damping=damping, reference=run.reference))
+        chains.append(
+            each.chain(flags.boundary, stiffness, axis=flags.axis, damping=damping, reference=run.reference)
+        )
         check_bands(chains[-1].n_particles, _n_bands(flags, chains[-1]))
     return frames, chains
 

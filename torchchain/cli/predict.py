@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +13,12 @@ import tomli_w
 import torch
 
 from torchchain import checks, plots
+from torchchain.chain import Chain, StandingWave, State
 from torchchain.cli import choices, outputs
 from torchchain.cli.flags import Predict
 from torchchain.cli.runs import config_of, merged_tables
-from torchchain.ensemble.scene import regular_times
+from torchchain.energy import StartEnergy, excited, start_energy
+from torchchain.ensemble.scene import Scene, regular_times
 from torchchain.ensemble.stages import Stages
 from torchchain.master import SOLVERS, MasterEquation, MasterFamily
 from torchchain.results import model_file
@@ -23,7 +26,8 @@ from torchchain.results import model_file
 if TYPE_CHECKING:
     import xarray
 
-PREDICT_KEYS = ("strength", "source", "initial", "times")
+PREDICT_KEYS = ("strength", "source", "initial", "times", "excitation", "state")
+STARTS = ("source", "initial", "excitation", "state")
 
 
 def run_predict(flags: Predict, arguments: list[str]) -> None:
@@ -48,9 +52,9 @@ def _predict(
         master = _loaded(path, given.get("strength")).to(device)
         digest = outputs.sha256(path)
     times = _times(given.get("times", {}))
-    starts, labels, request = _starts(given, master.n_bands)
+    starts, labels, request = _starts(given, master)
     with stages("prediction"):
-        energy = master.solve(starts, times, method=flags.method).detach().cpu()
+        energy = master.solve(starts.given, times, method=flags.method).detach().cpu()
     data = _dataset(master, path, starts, labels, times, energy)
     if "strength" in given:
         request["strength"] = float(given["strength"])
@@ -71,7 +75,9 @@ def _predict(
     }
     outputs.write(out, files)
     print(f"{len(labels)} starts, {len(times)} times to {float(times[-1]):g}, solved by {flags.method}")
-    print(f"largest change of total energy: {float((energy.sum(-1) - starts.sum(-1)[:, None]).abs().max()):.3g}")
+    print(f"largest change of total energy: {float((energy.sum(-1) - starts.bands.sum(-1)[:, None]).abs().max()):.3g}")
+    if bool(starts.rest.any()):
+        print(f"energy at k = 0, which stays there and is in no band: {float(starts.rest.max()):.3g}")
     print(f"lowest energy in a band: {float(energy.min()):.3g}")
     if "band_energy_stderr" in data:
         print(f"largest standard error: {float(data.band_energy_stderr.max()):.3g}")
@@ -94,27 +100,78 @@ def _times(times: Any) -> torch.Tensor:
     return regular_times(times.get("start", 0.0), times.get("stop", 50.0), times.get("step", 0.25))
 
 
-def _starts(given: Mapping[str, Any], n_bands: int) -> tuple[torch.Tensor, list[str], dict[str, Any]]:
-    """Energies at the start [start, band], their names, and what was asked for."""
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """What is solved for: energies of bands (start, band), or starts in space with that axis; and what is drawn of it."""
+
+    given: torch.Tensor | StartEnergy
+    bands: torch.Tensor
+    rest: torch.Tensor
+
+    @classmethod
+    def of(cls, given: torch.Tensor | StartEnergy, n_bands: int) -> Starts:
+        if isinstance(given, StartEnergy):
+            return cls(given, given.bands(n_bands), given.rigid)
+        return cls(given, given, torch.zeros(len(given)))
+
+
+def _starts(given: Mapping[str, Any], master: MasterEquation) -> tuple[Starts, list[str], dict[str, Any]]:
+    """What is solved for, the names of the starts, and what was asked for."""
+    n_bands, named = master.n_bands, [name for name in STARTS if name in given]
+    if len(named) > 1:
+        raise checks.fail(named[0], f"not be given together with {named[1]}", checks.shown(given[named[0]]))
+    if named and named[0] in ("excitation", "state"):
+        start, labels, request = _in_space(named[0], given[named[0]], master)
+        return Starts.of(start, n_bands), labels, request
     if "initial" in given:
-        if "source" in given:
-            raise checks.fail("source", "not be given together with initial", given["source"])
         initial = checks.real_tensor("initial", given["initial"])
         if tuple(initial.shape) != (n_bands,):
             raise checks.fail("initial", f"hold the {n_bands} bands of the model", f"{initial.numel()} numbers")
-        return initial[None], ["initial"], {"initial": initial.tolist()}
+        return Starts.of(initial[None], n_bands), ["initial"], {"initial": initial.tolist()}
     source = given.get("source", range(1, n_bands + 1))
     if isinstance(source, (str, Mapping, int)) or not len(source):
         raise checks.FieldTypeError(f"source must be a list of bands, got {checks.shown(source)}")
     bands = [checks.integer("source", s, 1, n_bands) for s in source]
     starts = torch.eye(n_bands, dtype=torch.float64)[[s - 1 for s in bands]]
-    return starts, [str(s) for s in bands], {"source": bands}
+    return Starts.of(starts, n_bands), [str(s) for s in bands], {"source": bands}
+
+
+def _in_space(
+    field: str, table: Any, master: MasterEquation
+) -> tuple[StartEnergy, list[str], dict[str, Any]]:
+    """A start from an excitation, or from displacement and velocity of every particle, of energy 1."""
+    if not isinstance(table, Mapping):
+        raise checks.FieldTypeError(f"{field} must be a table, got {checks.shown(table)}")
+    if master.starts is None:
+        raise checks.fail(field, "be left out for a model calibrated without other starts (use initial)", dict(table))
+    count, request = master.starts.n_particles, {field: dict(table)}
+    if field == "excitation":
+        scene = Scene.from_dict({field: dict(table), "n_particles": count, "n_bands": master.n_bands})
+        wave = scene.excitation
+        wave = replace(wave, tones=scene.tones) if isinstance(wave, StandingWave) else wave
+        start, labels = excited(wave, count), [f"tone {tone}" for tone in scene.tones] or ["impulse"]
+    else:
+        checks.known_keys(field, table, ("displacement", "velocity"))
+        told = {name: checks.real_tensor(f"{field}.{name}", values).double() for name, values in table.items()}
+        for name, values in told.items():
+            if tuple(values.shape) != (count,):
+                raise checks.fail(f"{field}.{name}", f"hold the {count} particles of the model", f"shape {tuple(values.shape)}")
+        if not told:
+            raise checks.fail(field, "hold displacement, velocity or both", "neither")
+        none = torch.zeros(count, dtype=torch.float64)
+        state = State(told.get("displacement", none), told.get("velocity", none))
+        start, labels = start_energy(Chain(torch.ones_like(none)), state), ["state"]
+    if start.rigid.ndim == 0:
+        start = StartEnergy(*(getattr(start, name)[None] for name in ("potential", "kinetic", "virial", "rigid")))
+    size = start.total[:, None]
+    unit = StartEnergy(start.potential / size, start.kinetic / size, start.virial / size, start.rigid / start.total)
+    return unit, labels, request
 
 
 def _dataset(
     master: MasterEquation,
     path: Path,
-    starts: torch.Tensor,
+    starts: Starts,
     labels: list[str],
     times: torch.Tensor,
     energy: torch.Tensor,
@@ -129,7 +186,7 @@ def _dataset(
     origin = "" if told is None else told.provenance if told.scene is None else told.scene.to_toml()
     variables = {"band_energy": (axes, energy.numpy(), {**units, "long_name": "energy in a band"})}
     if master.uncertainty is not None:
-        error = master.standard_error(starts, times).cpu().numpy()
+        error = master.standard_error(starts.given, times).cpu().numpy()
         variables["band_energy_stderr"] = (
             axes,
             error,
@@ -138,7 +195,7 @@ def _dataset(
     return xarray.Dataset(
         variables,
         coords={
-            "start": ("start", labels, {"long_name": "source band of the start"}),
+            "start": ("start", labels, {"long_name": "start: source band, or what it is in space"}),
             "time": ("time", times.numpy(), clock),
             "band": ("band", bands, {"long_name": plots.BAND_LABEL}),
         },
@@ -146,12 +203,12 @@ def _dataset(
     )
 
 
-def _figure(starts: torch.Tensor, labels: list[str], times: torch.Tensor, energy: torch.Tensor) -> Any:
+def _figure(starts: Starts, labels: list[str], times: torch.Tensor, energy: torch.Tensor) -> Any:
     shown = [0] if len(labels) == 1 else [round((len(labels) - 1) * f) for f in (10 / 32, 23 / 32)]
     with plots.style():
         figure, axes = plots.figure(plots.COLUMN * len(shown), 2.7, 1, len(shown))
         for ax, index in zip(axes[0], shown, strict=True):
-            total = float(starts[index].sum()) or 1.0
+            total = float(starts.bands[index].sum()) or 1.0
             plots.band_map(ax, times.numpy(), energy[index].numpy() / total, f"start: {labels[index]}")
         plots.lettered(axes.flat if len(shown) > 1 else ())
     return figure

@@ -138,7 +138,9 @@ class Checkpoint:
         """Remove the parts, once the results are elsewhere, and the folder if nothing else is in it."""
         with suppress(OSError):
             for path in self.folder.iterdir():
-                if _NAME.fullmatch(path.name.removesuffix(".tmp")):
+                if path.is_dir():  # of a run that belongs to this one
+                    Checkpoint(path).clear()
+                elif _NAME.fullmatch(path.name.removesuffix(".tmp")):
                     path.unlink(missing_ok=True)
             self.folder.rmdir()
 

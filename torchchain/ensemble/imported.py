@@ -68,10 +68,7 @@ def as_shares(times: Tensor, energies: Tensor) -> Tensor:
     left = total.mean(0) / first.mean(0)[:, None]
     if float(left.min()) < 1 - LOSS:
         words = f"down to {float(left.min()):.3g} of those at the first time, at {at(-left, *runs[1:])}"
-        warn(
-            "energies",
-            f"{words}: the model will lose that much, and what is left late stays (long_time= says what does)",
-        )
+        warn("energies", f"{words}: the model will lose that much, and what is left late stays (long_time= says what does)")
     return energies / total.clamp(min=1)[..., None]
 
 

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.chain import Chain
+from torchchain.chain.excitation import StandingWave
 from torchchain.chain.states import State, Trajectory
+from torchchain.energy.kicked import kicked_band_energy
 from torchchain.energy.space import energy_center, energy_width
 from torchchain.network import energy as spreading
 from torchchain.network import systems
@@ -118,6 +120,12 @@ def _band_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
     return share / systems.total_energy(chain, _start(scene, chain, trajectory))[..., None]
 
 
+def _kicked_band_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
+    if not isinstance(scene.excitation, StandingWave):
+        raise checks.fail("excitation", "be standing waves at rest for kicked_band_energy", "an impulse")
+    return kicked_band_energy(chain, trajectory, scene.n_bands, definition=scene.energy_definition)
+
+
 def _start(scene: Scene, chain: System, trajectory: Trajectory) -> Trajectory:
     """The start as a trajectory of one time."""
     state, axis, kind = scene.state(chain), -1, Trajectory
@@ -181,6 +189,10 @@ for _one in (
     Observable(
         "displacement", ("time", "particle"), "initial overlap", "displacement", lambda s, c, t: t.displacement,
         local=True, passes=2, kinds=CHAINS,
+    ),
+    Observable(
+        "kicked_band_energy", ("time", "band"), "1", "share of the energy in a band, had the standing wave been one of velocity",
+        _kicked_band_energy, wavenumbers=True, bands=True, damped=False, passes=30, kinds=CHAINS,
     ),
     Observable("dissipated", ("time",), _JOULE, "energy lost to contact damping so far", _dissipated, passes=0),
     Observable("energy", ("time", "particle"), _JOULE, "energy per particle", _energy, local=True, passes=16),

@@ -23,6 +23,7 @@ from torchchain.master.records import Fit, NoSettings, Recipe, ReducedModel
 from torchchain.master.report import Calibration, Report
 from torchchain.master.sample import Sample, loss_of
 from torchchain.master.selection import select
+from torchchain.master.starts import can_fit, fit_starts, with_errors
 from torchchain.master.uncertainty import draw_again, horizon
 from torchchain.progress import bar
 
@@ -163,7 +164,10 @@ def calibrate(
         _check_growth(fitted, asked)
         if replicates:
             errors = draw_again(transfer, asked, free, replicates, shown.update, fitted)
-    return MasterEquation(fitted, _record(transfer, asked, report), errors)
+        starts = fit_starts(transfer) if can_fit(transfer) else None
+        if starts is not None and errors is not None:
+            starts = with_errors(starts, transfer, errors)
+    return MasterEquation(fitted, _record(transfer, asked, report), errors, starts)
 
 
 def _settled(transfer: BandTransfer) -> BandTransfer:

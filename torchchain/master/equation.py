@@ -12,7 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from torchchain import checks, plots
-from torchchain.chain.excitation import StandingWave
+from torchchain.chain.excitation import Impulse, StandingWave
+from torchchain.energy.bands import center_tones
+from torchchain.energy.start_energy import StartEnergy, excited
 from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.scene import Scene, describe
 from torchchain.master import file
@@ -23,6 +25,7 @@ from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
 from torchchain.master.report import Calibration, Report
 from torchchain.master.solving import SOLVERS, IntegrationError
+from torchchain.master.starts import StartModel
 from torchchain.master.uncertainty import Uncertainty
 from torchchain.threads import single_thread
 
@@ -59,6 +62,7 @@ class MasterEquation(Printed, nn.Module):
         model: the reduced model.
         calibration: where it comes from; None for a model of your own.
         uncertainty: standard errors by bootstrap; None if there are none.
+        starts: the model of other starts than the calibrated tones at rest; None if there is none.
 
     Example:
         >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40, times=torch.linspace(0, 50, 51))
@@ -71,8 +75,9 @@ class MasterEquation(Printed, nn.Module):
     """
 
     def __init__(
-        self, model: TransferModel, calibration: Calibration | None, uncertainty: Uncertainty | None = None
-    ) -> None:
+        self, model: TransferModel, calibration: Calibration | None, uncertainty: Uncertainty | None = None,
+        starts: StartModel | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         checks.instance("model", model, TransferModel)
         checks.instance("calibration", calibration, Calibration, type(None))
@@ -80,6 +85,10 @@ class MasterEquation(Printed, nn.Module):
         self.model = model
         self.calibration = calibration or Calibration("given", "given", None)
         self.uncertainty = uncertainty
+        checks.instance("starts", starts, StartModel, type(None))
+        if starts is not None and starts.n_bands != model.n_bands:
+            raise checks.fail("starts", f"have the {model.n_bands} bands of the model", starts.n_bands)
+        self.starts = starts
 
     @property
     def rates(self) -> Tensor:
@@ -137,6 +146,8 @@ class MasterEquation(Printed, nn.Module):
             rows["held-out distance"] = (
                 f"{selection.held_out_distance:.4f}, of two halves {selection.halves_distance:.4f}"
             )
+        if self.starts is not None:
+            rows["starts"] = f"any on {self.starts.n_particles} particles: {self.starts.n_parameters} fitted numbers more"
         if bool(self.damping.any()):
             rows["damping"] = f"{float(self.damping.min()):.3g} to {float(self.damping.max()):.3g} per unit time"
         if self.calibration.report.certificate is not None:
@@ -147,8 +158,12 @@ class MasterEquation(Printed, nn.Module):
     def solve(self, initial: Any, times: Any, method: str = "expm", *, supply: Any = None, **options: Any) -> Tensor:
         """Band energies at the given times.
 
+        Energies per band are taken as those of the calibrated tones, released at rest.
+
         Args:
-            initial: energy per band at time 0, (*batch, band), in any unit.
+            initial: energy per band at time 0, (*batch, band), in any unit; or a start in space, of a model with ``starts``:
+                from :func:`torchchain.start_energy`, an Impulse, or a StandingWave (an axis of tones). Its energy at
+                k = 0 is in no band.
             times: (time,), increasing, not negative.
             method: a name in ``SOLVERS``: "expm" or a method of torchdiffeq.
             supply: energy fed into each band per unit time, (band,) at all times, or (*batch, time, band): constant
@@ -173,8 +188,23 @@ class MasterEquation(Printed, nn.Module):
         """
         solver = SOLVERS[checks.choice("method", method, SOLVERS)]
         checks.known_keys(f"options of solver '{method}'", options, solver.options)
-        initial = self._initial(initial)
         times = checks.times("times", times).to(self.rates)
+        start = self._start(initial)
+        if start is not None and self.starts is not None:
+            checks.choice("method for a start in space", method, ("expm",))
+            if supply is not None:
+                raise checks.fail("supply", "be None for a start in space", checks.shown(supply))
+            with single_thread():
+                energy = self.starts.solve(start, times).to(self.rates)
+            self._warn(start.bands(self.n_bands).to(self.rates), times, None, energy.detach())
+            return energy
+        if start is not None:
+            warnings.warn(
+                "the model was calibrated without other starts: energies of bands are taken as those of its own tones, released at rest",
+                TrustWarning,
+                stacklevel=2,
+            )
+        initial = self._initial(initial if start is None else start.bands(self.n_bands))
         fed = None if supply is None else self._supply(supply, initial, times)
         with single_thread():
             energy = solver.run(self.model, initial, times, fed, **options)
@@ -186,6 +216,18 @@ class MasterEquation(Printed, nn.Module):
     def transfer(self, times: Any) -> Tensor:
         """T(t) [source, time, receiver]: :meth:`solve` from a unit energy in each band, with its errors and warnings."""
         return self.solve(torch.eye(self.n_bands).to(self.basis), times)
+
+    def _start(self, initial: Any) -> StartEnergy | None:
+        """A start in space; None for energies of bands."""
+        scene = self.calibration.scene
+        if isinstance(initial, (Impulse, StandingWave)):
+            if scene is None and self.starts is None:
+                raise checks.fail("initial", "be energies of bands for a model without a scene", type(initial).__name__)
+            count = self.starts.n_particles if self.starts is not None else scene.n_particles  # type: ignore[union-attr]
+            if isinstance(initial, StandingWave) and initial.tones is None:
+                initial = replace(initial, tones=center_tones(count, self.n_bands))
+            return excited(initial, count)
+        return initial if isinstance(initial, StartEnergy) else None
 
     def _initial(self, initial: Any) -> Tensor:
         initial = checks.real_tensor("initial", initial).to(self.rates)
@@ -250,6 +292,10 @@ class MasterEquation(Printed, nn.Module):
         """
         if self.uncertainty is None:
             raise checks.fail("bootstrap", "be at least 2 in calibrate() for error bars", 0)
+        start = self._start(initial)
+        if start is not None and self.starts is not None:
+            return self.starts.standard_error(start, checks.times("times", times), self.uncertainty).to(self.rates)
+        initial = initial if start is None else start.bands(self.n_bands)
         return self.uncertainty.of(self._initial(initial), checks.times("times", times).to(self.rates))
 
     def dissipated(self, initial: Any, times: Any) -> Tensor:
@@ -289,6 +335,8 @@ class MasterEquation(Printed, nn.Module):
             found.append(
                 f"{scene.n_particles} particles, calibrated on {own.n_particles}, and waves that go round by t = {shorter}"
             )
+        if self.starts is not None and scene.n_particles == self.starts.n_particles:
+            return found  # any start will do
         return [*found, *_other_start(scene, own)]
 
     def plot_rates(self, ax: Axes | None = None) -> Axes:
@@ -355,7 +403,7 @@ class MasterEquation(Printed, nn.Module):
         Raises:
             FieldError: where the file cannot be written, and for a report whose numbers are not finite.
         """
-        file.save((self.model, self.calibration, self.uncertainty), path)
+        file.save((self.model, self.calibration, self.uncertainty, self.starts), path)
 
     @classmethod
     def load(cls, path: str | Path) -> MasterEquation:

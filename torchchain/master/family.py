@@ -151,7 +151,7 @@ class MasterFamily(Printed):
 
     def save(self, path: str | Path) -> None:
         """Write all members to one safetensors file, all or nothing."""
-        file.save_family([(m.model, m.calibration, m.uncertainty) for m in self.members], path)
+        file.save_family([(m.model, m.calibration, m.uncertainty, m.starts) for m in self.members], path)
 
     @classmethod
     def load(cls, path: str | Path) -> MasterFamily:

@@ -24,6 +24,7 @@ from torchchain.master.fits import checked_window
 from torchchain.master.ladder import kinds, methods
 from torchchain.master.model import TransferModel
 from torchchain.master.report import Calibration, Report
+from torchchain.master.starts import StartModel
 from torchchain.master.uncertainty import Uncertainty
 
 FORMAT = "torchchain-master-equation"
@@ -47,28 +48,30 @@ ERROR_AXES = {
 """Of the error bars, which a file holds all or none of."""
 LONGEST_AXIS = 128
 """Functions, or times of the error bars."""
-MOST_TERMS = 2**14
-"""Of polynomials."""
+MOST_TERMS, LONG_AXES = 2**14, ("term", "start_tone")
+"""Of polynomials, and tones of a ring."""
 MOST_MEMBERS = 64
 
 
-Member = tuple[TransferModel, Calibration, Uncertainty | None]
-"""A model, how it was calibrated, and its error bars."""
+Member = tuple[TransferModel, Calibration, Uncertainty | None, StartModel | None]
+"""A model, how it was calibrated, its error bars, and the model of other starts."""
+STARTS = "starts."
+"""Before the names of the tensors of the latter, which a file holds all or none of."""
 
 
 def save(member: Member, path: str | Path) -> None:
     """Write a model; the file appears whole or not at all."""
-    model, record, uncertainty = member
-    _write(_described(model, record), _packed(model, uncertainty), path)
+    model, record, uncertainty, starts = member
+    _write(_described(model, record), _packed(model, uncertainty, starts), path)
 
 
 def save_family(members: Sequence[Member], path: str | Path) -> None:
     """Write models for several strengths of the disorder in one file."""
-    headers = [_described(model, record) for model, record, _ in members]
+    headers = [_described(model, record) for model, record, *_ in members]
     tensors = {
         f"{i}.{name}": value
-        for i, (model, _, uncertainty) in enumerate(members)
-        for name, value in _packed(model, uncertainty).items()
+        for i, (model, _, uncertainty, starts) in enumerate(members)
+        for name, value in _packed(model, uncertainty, starts).items()
     }
     _write({"format": FAMILY_FORMAT, "format_version": FORMAT_VERSION, "members": headers}, tensors, path)
 
@@ -107,8 +110,11 @@ def _proved(model: TransferModel, report: Report) -> Report:
     return report
 
 
-def _packed(model: TransferModel, uncertainty: Uncertainty | None) -> dict[str, torch.Tensor]:
+def _packed(
+    model: TransferModel, uncertainty: Uncertainty | None, starts: StartModel | None
+) -> dict[str, torch.Tensor]:
     every = model.tensors() | (uncertainty.tensors() if uncertainty is not None else {})
+    every |= {} if starts is None else {STARTS + name: value for name, value in starts.tensors().items()}
     return {name: value.detach().cpu().contiguous() for name, value in every.items()}
 
 
@@ -170,6 +176,8 @@ def _member(where: str, header: dict[str, Any], tensors: dict[str, torch.Tensor]
     try:
         errors = {name: tensors.pop(name) for name in ERROR_AXES if name in tensors}
         uncertainty = Uncertainty.from_tensors(**errors) if errors else None
+        others = {name: tensors.pop(STARTS + name) for name in StartModel.AXES if STARTS + name in tensors}
+        starts = StartModel(**others, n_bands=header["n_bands"]) if others else None
         model = kinds()[header["kind"]](**tensors)
         scene = None if header["scene"] is None else Scene.from_dict(header["scene"])
         window = None if header["window"] is None else checked_window(header["window"])
@@ -188,7 +196,7 @@ def _member(where: str, header: dict[str, Any], tensors: dict[str, torch.Tensor]
     record = Calibration(header["method"], header["model"], window, scene, report, header["provenance"])
     if header["strength"] != record.strength:
         raise checks.fail(where, "state the strength of its scene", header["strength"])
-    return model, record, uncertainty
+    return model, record, uncertainty, starts
 
 
 def _headers(where: str, metadata: Mapping[str, str], expected: str) -> list[dict[str, Any]]:
@@ -264,6 +272,8 @@ def _model_tensors(
     expected = kinds()[header["kind"]].axes
     if any(prefix + name in names for name in ERROR_AXES):
         expected = expected | ERROR_AXES
+    if any(name.startswith(prefix + STARTS) for name in names):
+        expected = expected | {STARTS + name: axes for name, axes in StartModel.AXES.items()}
     if names != {prefix + name for name in expected}:
         wanted = ", ".join(sorted(prefix + name for name in expected))
         raise checks.fail(where, f"hold the tensors {wanted}", checks.shown(sorted(names)[:4]))
@@ -272,7 +282,7 @@ def _model_tensors(
         part = file.get_slice(prefix + name)
         shape = tuple(part.get_shape())
         fits = len(shape) == len(axes) and all(
-            size == header["n_bands"] if axis == "band" else size <= (MOST_TERMS if axis == "term" else LONGEST_AXIS)
+            size == header["n_bands"] if axis == "band" else size <= (MOST_TERMS if axis in LONG_AXES else LONGEST_AXIS)
             for size, axis in zip(shape, axes, strict=True)
         )
         if not fits:

@@ -116,11 +116,11 @@ class Regression:
         return table
 
 
-def solve(regressions: Sequence[Regression], mixing: np.ndarray, start: np.ndarray | None = None, progress: Any = None) -> tuple[np.ndarray, dict[str, Any]]:  # fmt: skip
+def solve(regressions: Sequence[Any], mixing: np.ndarray, start: np.ndarray | None = None, progress: Any = None) -> tuple[np.ndarray, dict[str, Any]]:  # fmt: skip
     """Levenberg's and Marquardt's method for several regressions whose coefficients are mixtures of common ones.
 
     Args:
-        regressions: of the same degrees.
+        regressions: of the same degrees, each a :class:`Regression` or like one.
         mixing: weight of each of the common sets of coefficients in each regression, (regression, set).
         start: (set, coefficient); zero if None.
         progress: called with 1 after each step.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.chain.excitation import StandingWave
+from torchchain.energy.start_energy import StartEnergy, excited
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.plan import ARTIFACT, Choice, Plan, statistical_error
 from torchchain.ensemble.scene import Scene
@@ -27,8 +30,13 @@ def missing(master: MasterEquation, scene: Scene) -> list[str]:
     return found
 
 
-def starts(master: MasterEquation, scene: Scene) -> Tensor:
-    """A unit energy in the band of each tone, (tone, band)."""
+def starts(master: MasterEquation, scene: Scene) -> Tensor | StartEnergy:
+    """A unit energy in the band of each tone, (tone, band); of a model of any start, that of the scene, of energy 1 each."""
+    if master.starts is not None:
+        wave = scene.excitation
+        found = excited(replace(wave, tones=scene.tones) if isinstance(wave, StandingWave) else wave, scene.n_particles)
+        size = found.total[..., None]
+        return StartEnergy(found.potential / size, found.kinetic / size, found.virial / size, found.rigid / found.total)
     return torch.eye(master.n_bands, dtype=torch.float64)[[band - 1 for band in scene.source_bands]]
 
 

@@ -62,8 +62,8 @@ class Waves:
         width = n // 2 // bands
         inside = np.arange(width) if width <= TONES else (np.arange(TONES) + 0.5) * width / TONES - 0.5
         tones = np.arange(bands)[:, None] * width + inside + 1
-        source = _poles(2 * np.sin(np.pi / n * np.array(scene.tones, dtype=float)), strength)
-        receiver = _poles(2 * np.sin(np.pi / n * tones), strength)
+        source = poles(2 * np.sin(np.pi / n * np.array(scene.tones, dtype=float)), strength)
+        receiver = poles(2 * np.sin(np.pi / n * tones), strength)
         coupling = strength**2 / n * width / len(inside)
         found = (source.real, -WIDTH * source.imag, receiver.real, -WIDTH * receiver.imag)
         frequency, decay, others, other_decay = (torch.from_numpy(value.copy()) for value in found)
@@ -76,7 +76,7 @@ class Waves:
         }  # fmt: skip
 
 
-def _poles(frequency: np.ndarray, strength: float) -> np.ndarray:
+def poles(frequency: np.ndarray, strength: float) -> np.ndarray:
     """Complex frequencies z = w / sqrt(mu(Re z)) of waves of the ordered chain's frequency w, imaginary parts below 0.
 
     The effective mass mu = 1 + xi^2 z^2 g with the local response g = 1 / sqrt(e (e - 4)), e = z^2 mu, Im g > 0, of the
@@ -95,22 +95,36 @@ def first_odds(waves: Waves, times: Tensor, sources: Tensor) -> Tensor:
     """D [source, time, receiver], positive, of some sources; times may be infinite."""
     w, g = waves.source_frequency[sources][:, None, None, None], waves.source_decay[sources][:, None, None, None]
     other, decay = waves.tone_frequency[:, :, None], waves.tone_decay[:, :, None]  # [receiver, tone, time]
-    rate = g + decay
-    size = waves.coupling * w * other
-    slow, fast = (w - other).abs(), w + other
-    finite = times.isfinite()
+    return (waves.coupling * scattered(w, other, g + decay, times)).sum(2).transpose(1, 2)
+
+
+def scattered(w: Tensor, other: Tensor, rate: Tensor, times: Tensor, kicked: bool = False) -> Tensor:
+    """D over c, positive, (..., time), of waves of frequency w, released at rest, or kicked, into those of another.
+
+    The odds after a kick are c w^2 (h(w - w') + h(w + w')), which start as t^2.
+
+    Args:
+        w, other, rate: frequencies, and the sum of both decays, (..., 1).
+        times: (time,), may be infinite.
+        kicked: whether the wave began as one of velocity.
+    """
+    slow, fast, finite = (w - other).abs(), w + other, times.isfinite()
     t = torch.where(finite, times, torch.zeros_like(times))
-    beat = _response(slow, rate, t) - _response(fast, rate, t)
-    beat = torch.where(t < SERIES, _early(slow, fast, rate, t.clamp(max=SERIES)), beat)
-    late = 1 / (slow**2 + rate**2) - 1 / (fast**2 + rate**2)
-    beat = torch.where(finite, beat, late)
-    # t^4 w w' / 6 at first, and a Lorentzian in the end
+    near, far = _response(slow, rate, t), _response(fast, rate, t)
+    last_near, last_far = 1 / (slow**2 + rate**2), 1 / (fast**2 + rate**2)
     squared = t**2
-    rise = squared**2 * w * other / 6 / ((1 + squared * fast**2 / 12) * (1 + squared * (slow**2 + rate**2) / 2))
-    ending = 4 * w * other / (fast**2 * (slow**2 + rate**2))
+    settled = 1 + squared * (slow**2 + rate**2) / 2
+    if kicked:  # t^2 at first, and two Lorentzians in the end
+        size, beat, late = w * w, near + far, last_near + last_far
+        rise, ending = squared / settled, late
+    else:  # t^4 w w' / 6 at first, and a Lorentzian in the end
+        size, late = w * other, last_near - last_far
+        beat = torch.where(t < SERIES, _early(slow, fast, rate, t.clamp(max=SERIES)), near - far)
+        rise = squared**2 * w * other / 6 / ((1 + squared * fast**2 / 12) * settled)
+        ending = 4 * w * other / (fast**2 * (slow**2 + rate**2))
+    beat = torch.where(finite, beat, late)
     least = FLOOR * torch.where(finite, rise, ending)
-    beat = size * (beat + (beat**2 + 4 * least**2).sqrt()) / 2
-    return beat.sum(2).transpose(1, 2)
+    return size * (beat + (beat**2 + 4 * least**2).sqrt()) / 2
 
 
 def _response(x: Tensor, rate: Tensor, t: Tensor) -> Tensor:

@@ -47,7 +47,7 @@ class TriadModel(nn.Module):
         >>> bands = tc.mixing.FrequencyBands(n_bands=4, top=2.0)
         >>> n = len(tc.mixing.triads_of(bands)[0])
         >>> model = tc.mixing.TriadModel(bands, torch.full((4,), 0.25), torch.full((n,), 0.02))
-        >>> energy = model.solve([0.01, 0.03, 0.0, 0.0], [0.0, 100.0, 1e6])
+        >>> energy = model.solve([0.01, 0.03, 0.0, 0.0], [0.0, 100.0, 4e3])
         >>> energy[-1].round(decimals=4).tolist()  # equipartition
         [0.01, 0.01, 0.01, 0.01]
     """

@@ -1,0 +1,271 @@
+"""What becomes of any start in space: a small model of the transfer from every tone, released or kicked.
+
+A start (u0, v0) of a linear chain has energies that are quadratic in it. Averaged over an ensemble of rings, in which all
+places and both directions are alike, no two wavenumbers mix:
+
+    e_r(t) = sum_n  P_n T[n, r](t) + K_n T'[n, r](t) + G_n dT'[n, r]/dt,
+
+with P and K the potential and kinetic energies of tone n, and G = Re(u* v) its virial, which vanishes for traveling waves.
+T belongs to waves released at rest, T' to kicked ones (:mod:`torchchain.master.tones`). That the two meet in the derivative
+of T' is exact: a moment after the kick v0 the state is (v0 dt, v0).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchchain import checks
+from torchchain.energy.start_energy import StartEnergy
+from torchchain.ensemble.starts import KINDS
+from torchchain.ensemble.statistics import statistical_distance
+from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.compact import checked_degrees, n_coefficients
+from torchchain.master.logistic import BEYOND, chosen_times, solve
+from torchchain.master.misfit import model_error
+from torchchain.master.tones import ToneRegression, Tones, shares
+from torchchain.master.uncertainty import Uncertainty
+from torchchain.threads import single_blas_thread
+
+DEGREES = (12, 8, 16)
+"""In place, distance and time; with fewer times fewer in time."""
+STEP = 1e-3
+"""Of the derivative by time, relative to the time at which the state is looked at, and in time units at most."""
+TOGETHER = 2**22
+"""Pairs of tones times times that are computed at once."""
+EVENNESS = 0.5
+"""Weight of a source's own error in a fit, rather than of the mean over sources."""
+
+
+class StartModel(nn.Module):
+    """T of waves released at rest and of kicked ones, for every tone of a ring and every time t >= 0.
+
+    Both are never negative, and add up to 1 over the bands. Computed in double precision.
+
+    Args:
+        degrees: of the polynomials in place, distance and time, (3,).
+        released, kicked: their coefficients, (term,).
+        frequency, decay: of the waves of tones 1 to N / 2, (tone,).
+        coupling: variance of the disorder for each tone.
+        n_bands: B.
+        scale_times, scale: factors by which the errors of T and T' exceed those of the bands' own model at some times,
+            (start_time,) and (kind, start_time); no times if unknown.
+    """
+
+    AXES: ClassVar[dict[str, tuple[str, ...]]] = {
+        "degrees": ("degree",), "released": ("term",), "kicked": ("term",), "frequency": ("start_tone",), "decay": ("start_tone",),
+        "coupling": (), "scale_times": ("start_time",), "scale": ("kind", "start_time"),
+    }  # fmt: skip
+
+    def __init__(
+        self, degrees: Tensor, released: Tensor, kicked: Tensor, frequency: Tensor, decay: Tensor, coupling: Tensor,
+        scale_times: Tensor, scale: Tensor, n_bands: int,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        degrees = checks.real_tensor("starts.degrees", degrees)
+        self.degrees = checked_degrees([int(value) for value in degrees.flatten()])
+        size, count = n_coefficients(self.degrees), len(frequency)
+        shapes = {
+            "released": (released, (size,)), "kicked": (kicked, (size,)), "frequency": (frequency, (count,)),
+            "decay": (decay, (count,)), "coupling": (coupling, ()), "scale_times": (scale_times, (len(scale_times),)),
+            "scale": (scale, (2, len(scale_times))),
+        }  # fmt: skip
+        for name, (value, shape) in shapes.items():
+            value = checks.real_tensor(f"starts.{name}", value).double()
+            if tuple(value.shape) != shape:
+                raise checks.fail(f"starts.{name}", f"have shape {shape}", f"shape {tuple(value.shape)}")
+            if name in ("frequency", "decay", "coupling"):
+                checks.first_bad(f"starts.{name}", "be positive", value, ~(value > 0), "tone")
+            self.register_buffer(name, value.detach().clone())
+        self.released: Tensor
+        self.kicked: Tensor
+        self.scale_times: Tensor
+        self.scale: Tensor
+        if not count or count % n_bands:
+            raise checks.fail("starts.frequency", f"hold tones of {n_bands} bands alike", count)
+        if not bool((self.scale >= 0).all()) or not bool((self.scale_times.diff() > 0).all()):
+            raise checks.fail("starts.scale", "hold factors at increasing times", "others")
+        self.n_bands = n_bands
+
+    def _apply(self, fn: Any, recurse: bool = True) -> StartModel:
+        """Moved to a device, not to another precision: derivatives by time need double."""
+        super()._apply(lambda value: fn(value).double() if value.is_floating_point() else fn(value), recurse)
+        return self
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All that makes the model but ``n_bands``, as its constructor takes it."""
+        degrees = self.released.new_tensor(self.degrees)
+        return {"degrees": degrees, **{name: getattr(self, name) for name in self.AXES if name != "degrees"}}
+
+    @property
+    def n_parameters(self) -> int:
+        """Fitted numbers."""
+        return len(self.released) + len(self.kicked)
+
+    @property
+    def n_particles(self) -> int:
+        """N, of the rings."""
+        return 2 * len(self.get_buffer("frequency"))
+
+    @property
+    def _tones(self) -> Tones:
+        return Tones(**{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling")}, n_bands=self.n_bands)
+
+    def transfer(self, kind: str, tones: Any, times: Tensor) -> Tensor:
+        """T [tone, time, receiver] of some tones, counted from 1.
+
+        Args:
+            kind: "released" or "kicked".
+            tones: integers.
+            times: (time,), not negative.
+        """
+        checks.choice("kind", kind, KINDS)
+        numbers = torch.tensor([checks.integer("tones", tone, 1, self.n_particles // 2) - 1 for tone in tones])
+        return self._shares(kind, numbers.to(self.released.device), times.to(self.released))
+
+    def _shares(self, kind: str, numbers: Tensor, times: Tensor) -> Tensor:
+        coefficients = self.released if kind == KINDS[0] else self.kicked
+        window = max(1, TOGETHER // (len(numbers) * len(self.get_buffer("frequency"))))
+        parts = [shares(self._tones, kind, self.degrees, coefficients, numbers, part) for part in times.split(window)]
+        return torch.cat(parts, 1)
+
+    def solve(self, start: StartEnergy, times: Tensor) -> Tensor:
+        """Energies (*batch, time, band) after a start; that at k = 0 is in no band."""
+        self.check(start)
+        times = times.to(self.released)
+        energy = self.released.new_zeros(*start.rigid.shape, len(times), self.n_bands)
+        for values, transfer in self._parts(start, times):
+            energy = energy + torch.einsum("...s,str->...tr", values, transfer)
+        return energy
+
+    def _parts(self, start: StartEnergy, times: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Energies of tones that start with some, and what becomes of a unit of each."""
+        for name in ("potential", "kinetic", "virial"):
+            values = getattr(start, name).to(self.released)
+            used = (values.reshape(-1, values.shape[-1]) != 0).any(0).nonzero()[:, 0]
+            if len(used) and name == "virial":
+                step = STEP * (1 + times).clamp(max=10.0)
+                before = (times - step).clamp(min=0)
+                ahead, behind = (self._shares(KINDS[1], used, when) for when in (times + step, before))
+                yield values[..., used], (ahead - behind) / (times + step - before)[:, None]
+            elif len(used):
+                yield values[..., used], self._shares(KINDS[name == "kinetic"], used, times)
+
+    def standard_error(self, start: StartEnergy, times: Tensor, uncertainty: Uncertainty) -> Tensor:
+        """Standard error of :meth:`solve`, (*batch, time, band), from that of the bands' own model.
+
+        Tones of one band have the same error, bands have errors of their own.
+        """
+        self.check(start)
+        times = times.to(self.released)
+        total = self.released.new_zeros(*start.rigid.shape, len(times), self.n_bands)
+        width = start.potential.shape[-1] // self.n_bands
+        for row, name in enumerate(("potential", "kinetic")):
+            values = getattr(start, name).to(self.released)
+            bands = values.reshape(*values.shape[:-1], self.n_bands, width).sum(-1)
+            total = total + uncertainty.of(bands, times).square() * self._scale(row, times).square()[:, None]
+        return total.sqrt()
+
+    def _scale(self, row: int, times: Tensor) -> Tensor:
+        if not len(self.scale_times):
+            return torch.ones_like(times)
+        found = np.interp(times.cpu().numpy(), self.scale_times.cpu().numpy(), self.scale[row].cpu().numpy())
+        return torch.from_numpy(found).to(times)
+
+    def check(self, start: StartEnergy) -> None:
+        """An error for a start on rings of another length."""
+        if start.n_particles != self.n_particles:
+            raise checks.fail("initial", f"be a start on {self.n_particles} particles, as calibrated", start.n_particles)
+
+
+def can_fit(transfer: BandTransfer) -> bool:
+    """Whether a transfer tells of other starts, and of disorder from which their model follows."""
+    return transfer.starts is not None and transfer.scene is not None and not transfer.is_ordered
+
+
+def fit_starts(transfer: BandTransfer) -> StartModel:
+    """The model of a transfer's starts; half of a second for 32 bands.
+
+    Waves released at rest also see the calibrated tones of the whole ensemble. Where its long-time average is known both
+    kinds are held to it: what kicks then differ by is taken from the last time.
+    """
+    scene, starts = transfer.scene, transfer.starts
+    assert scene is not None, "can_fit has said so"
+    assert starts is not None, "and so"
+    other = scene.stiffness_disorder
+    strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
+    tones = Tones.of(scene.n_particles, scene.n_bands, strength)
+    degrees = (*DEGREES[:2], max(2, min(DEGREES[2], (len(starts.times) - 1) // 2)))
+    numbers, own = (torch.tensor(found) - 1 for found in (starts.tones, scene.tones))
+    later = starts.times > 0
+    center = torch.isin(numbers, own)
+    picked = chosen_times(transfer.times)
+    whole = transfer.times[picked], transfer.mean[:, picked].double(), transfer.stderr[:, picked].double()
+    late = transfer.long_time if len(picked) else None
+    coefficients: dict[str, Tensor] = {}
+    with single_blas_thread():
+        for kind in KINDS:
+            mean, stderr = getattr(starts, kind)[:, later], getattr(starts, f"{kind}_stderr")[:, later]
+            told = [(numbers, starts.times[later], mean, stderr)]
+            if kind == KINDS[0] and len(picked):
+                told = [(numbers[~center], starts.times[later], mean[~center], stderr[~center]), (own, *whole)]
+            if late is not None:
+                end, error = late.double(), whole[2][:, -1:]
+                if kind == KINDS[1]:
+                    end = (end + mean[center, -1] - starts.released[center, -1]).clamp(min=0)
+                    end, error = end / end.sum(-1, keepdim=True), stderr[center, -1:]
+                beyond = transfer.times.new_tensor([*BEYOND, math.inf])
+                shape = (-1, len(beyond), -1)
+                told.append((own, transfer.times[-1] * beyond, end[:, None].expand(shape), error.expand(shape)))
+            problems = [
+                ToneRegression(tones, kind, degrees, which, times, data, _weights(error))
+                for which, times, data, error in told
+                if len(which)
+            ]
+            found, _ = solve(problems, np.ones((len(problems), 1)))
+            coefficients[kind] = torch.from_numpy(found[0])
+    none = torch.zeros(0, dtype=torch.float64)
+    return StartModel(
+        torch.tensor(degrees, dtype=torch.float64), **coefficients, frequency=tones.frequency, decay=tones.decay,
+        coupling=tones.coupling, scale_times=none, scale=none.expand(2, 0), n_bands=scene.n_bands,
+    )  # fmt: skip
+
+
+def _weights(stderr: Tensor) -> Tensor:
+    """Inverse of the error of each energy, (source, time), from the standard errors (source, time, band)."""
+    distance = statistical_distance(stderr)
+    distance = distance.clamp(min=max(1e-5 * float(distance.max()), 1e-300))
+    mean = distance.mean(0) ** (1 - EVENNESS) * distance**EVENNESS
+    return stderr.shape[-1] / math.sqrt(math.pi) / mean
+
+
+def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertainty) -> StartModel:
+    """The model with the factors by which its errors exceed those of the bands' own model.
+
+    Where it was fitted to fewer samples they are larger, and where it misses its data by more than their noise explains.
+    """
+    starts, scene = transfer.starts, transfer.scene
+    assert starts is not None, "the model was fitted to them"
+    assert scene is not None, "and of these chains"
+    times, width = starts.times[1:], scene.n_particles // 2 // scene.n_bands
+    base = uncertainty.of(torch.eye(scene.n_bands, dtype=torch.float64), times)
+    numbers = torch.tensor(starts.tones) - 1
+    center = torch.isin(numbers, torch.tensor(scene.tones) - 1)
+    sets = [center, ~center] if width > 1 else [center]
+    fewer = sum(transfer.block_counts) / starts.samples / len(sets)
+    rows = []
+    for kind in KINDS:
+        spread = base * (max(1.0, math.sqrt(fewer)) if kind == KINDS[1] else 1.0)
+        total = torch.zeros_like(times)
+        for one in sets:
+            found = model.transfer(kind, (numbers[one] + 1).tolist(), times)
+            mean, stderr = (getattr(starts, name)[one, 1:] for name in (kind, f"{kind}_stderr"))
+            own = model_error(found, mean, stderr, torch.minimum(spread, stderr))
+            total += (spread.square() + own.square()).sum((0, 2)) / len(sets)
+        rows.append((total / base.square().sum((0, 2)).clamp(min=1e-300)).sqrt())
+    return StartModel(**model.tensors() | {"scale_times": times, "scale": torch.stack(rows)}, n_bands=model.n_bands)

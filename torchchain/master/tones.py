@@ -1,0 +1,185 @@
+"""The transfer from single tones, released at rest or kicked, in the form of :mod:`torchchain.master.compact` tone by tone.
+
+The odds of finding energy of tone n in tone m rather than still in n are, summed over the tones m of a band,
+
+    D_nm(t) exp(p(u, v, tau)),    and in n itself    exp(q(n, tau)).
+
+D is second-order perturbation theory: with h the response to a beat and c the variance of the disorder for each tone,
+
+    released  c w w' (h(w - w') - h(w + w')),    kicked  c w^2 (h(w - w') + h(w + w')).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchchain.ensemble.starts import KINDS
+from torchchain.master.compact import LARGEST_EXPONENT, clock_of, polynomials, terms
+from torchchain.master.logistic import RIDGE
+from torchchain.master.waves import WIDTH, poles, scattered
+
+
+@dataclass(frozen=True, eq=False)
+class Tones:
+    """The tones of a ring as waves of an effective medium.
+
+    Attributes:
+        frequency, decay: of tones 1 to N / 2, (tone,), float64.
+        coupling: variance of the disorder for each tone, ().
+        n_bands: B.
+    """
+
+    frequency: Tensor
+    decay: Tensor
+    coupling: Tensor
+    n_bands: int
+
+    @classmethod
+    def of(cls, n_particles: int, n_bands: int, strength: float) -> Tones:
+        """Those of rings whose masses have a standard deviation, in the self-consistent Born approximation."""
+        tones = np.arange(1, n_particles // 2 + 1)
+        z = poles(2 * np.sin(np.pi / n_particles * tones), strength)
+        coupling = torch.tensor(strength**2 / n_particles, dtype=torch.float64)
+        return cls(torch.from_numpy(z.real.copy()), torch.from_numpy(-WIDTH * z.imag), coupling, n_bands)
+
+    def __len__(self) -> int:
+        return len(self.frequency)
+
+    @property
+    def width(self) -> int:
+        """Tones of a band."""
+        return len(self) // self.n_bands
+
+    def band(self, numbers: Tensor) -> Tensor:
+        """The band of each tone, both counted from 0."""
+        return numbers // self.width
+
+    def odds(self, kind: str, numbers: Tensor, times: Tensor) -> Tensor:
+        """D summed over the tones of each band but the source itself, (source, time, band); times may be infinite.
+
+        Args:
+            kind: of :data:`KINDS`.
+            numbers: of the sources, from 0, (source,).
+            times: (time,).
+        """
+        w, g = self.frequency[numbers][:, None, None], self.decay[numbers][:, None, None]
+        rate = g + self.decay[:, None]
+        each = self.coupling * scattered(w, self.frequency[:, None], rate, times, kind == KINDS[1])
+        each = each * (torch.arange(len(self), device=times.device)[:, None] != numbers[:, None, None])
+        return each.reshape(len(numbers), self.n_bands, self.width, len(times)).sum(2).transpose(1, 2)
+
+    def shapes(self, numbers: Tensor, degrees: Sequence[int]) -> Tensor:
+        """Polynomials of place and distance, (source, slot, term): slots are the bands, and last the source's own tone."""
+        every = torch.arange(len(self), device=self.frequency.device)
+        place = (every.to(self.frequency) + 0.5) / len(self)
+        whole = self._distance(every)
+        low, high = whole[whole > 0].min(), whole.max()
+        distance = ((self._distance(numbers) - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
+        middle = (place[numbers][:, None] + place.reshape(self.n_bands, -1).mean(1)) / 2
+        u, v, own = (
+            polynomials(x, degree)
+            for x, degree in ((middle, degrees[0]), (distance, degrees[1]), (place[numbers], degrees[0]))
+        )
+        p, _ = terms(degrees)
+        pairs = list(dict.fromkeys((i, j) for i, j, _ in p))
+        between = torch.stack([u[..., i] * v[..., j] for i, j in pairs], dim=-1)
+        upper = torch.cat([between, between.new_zeros(*between.shape[:-1], own.shape[-1])], -1)
+        lower = torch.cat([own.new_zeros(len(own), len(pairs)), own], -1)
+        return torch.cat([upper, lower[:, None]], dim=1)
+
+    def _distance(self, numbers: Tensor) -> Tensor:
+        """Mean logarithmic distance to the tones of each band but the source, the nearest counting most, (source, band)."""
+        gap = (self.frequency[numbers][:, None] - self.frequency).abs()
+        rate = self.decay[numbers][:, None] + self.decay
+        weight = (torch.arange(len(self), device=gap.device) != numbers[:, None]) / (gap**2 + rate**2)
+        far, total = (
+            x.reshape(len(numbers), self.n_bands, self.width).sum(-1) for x in (torch.asinh(gap / rate) * weight, weight)
+        )
+        return far / total.clamp(min=1e-300)
+
+
+def held(degrees: Sequence[int]) -> np.ndarray:
+    """Which products of a shape and a polynomial of time are coefficients, bool (term, degree)."""
+    rows = []
+    for part in terms(degrees):
+        for head in dict.fromkeys(entry[:-1] for entry in part):
+            here = {entry[-1] for entry in part if entry[:-1] == head}
+            rows.append([k in here for k in range(degrees[2] + 1)])
+    return np.array(rows)
+
+
+def shares(
+    tones: Tones, kind: str, degrees: Sequence[int], coefficients: Tensor, numbers: Tensor, times: Tensor
+) -> Tensor:
+    """T (source, time, band) of some sources: odds over their sum, never negative."""
+    index = torch.from_numpy(held(degrees)).to(coefficients.device)
+    table = coefficients.new_zeros(index.shape).masked_scatter(index, coefficients)
+    exponent = torch.einsum("srp,pt->str", tones.shapes(numbers, degrees), table @ polynomials(clock_of(times), degrees[2]).T)
+    moved = exponent.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).exp()
+    moved = torch.cat([tones.odds(kind, numbers, times) * moved[..., :-1], moved[..., -1:]], -1)
+    moved = moved / moved.sum(-1, keepdim=True)
+    own = torch.nn.functional.one_hot(tones.band(numbers), tones.n_bands).to(moved)
+    return moved[..., :-1] + own[:, None] * moved[..., -1:]
+
+
+class ToneRegression:
+    """A logistic regression for :func:`torchchain.master.compact.solve`: measured T of some tones and times.
+
+    Args:
+        tones, kind, degrees, numbers, times: see :func:`shares`.
+        data: T, (source, time, band).
+        weight: inverse of the error, (source, time).
+    """
+
+    def __init__(
+        self, tones: Tones, kind: str, degrees: Sequence[int], numbers: Tensor, times: Tensor, data: Tensor, weight: Tensor
+    ) -> None:
+        odds = tones.odds(kind, numbers, times)
+        self.odds = torch.cat([odds, torch.ones_like(odds[..., :1])], -1).numpy()
+        self.shape = tones.shapes(numbers, degrees).numpy()
+        self.clock = polynomials(clock_of(times), degrees[2]).numpy()
+        self.held, self.data, self.weight = held(degrees), data.numpy(), weight.numpy()
+        self.own = np.arange(len(numbers)), tones.band(numbers).numpy()
+
+    def table(self, coefficients: np.ndarray) -> np.ndarray:
+        """Coefficients as a table, zeros where none is."""
+        table = np.zeros(self.held.shape)
+        table[self.held] = coefficients
+        return table
+
+    def misfit(self, table: np.ndarray) -> tuple[float, np.ndarray]:
+        """Weighted sum of squares with the ridge, and the share of every slot, (source, time, slot)."""
+        exponent = np.clip(self.shape @ (table @ self.clock.T), -LARGEST_EXPONENT, LARGEST_EXPONENT)
+        slots = self.odds * np.exp(exponent).transpose(0, 2, 1)
+        slots /= slots.sum(-1, keepdims=True)
+        missed = (self._bands(slots) - self.data) * self.weight[..., None]
+        return float((missed**2).sum() + RIDGE * (table**2).sum()), slots
+
+    def normal(self, slots: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix and right-hand side of the linearized problem, over the coefficients that are held."""
+        size, degree = self.held.shape
+        squares, pull = np.zeros((len(self.clock), size, size)), np.zeros((size, degree))
+        missed = (self.data - self._bands(slots)) * self.weight[..., None]
+        for i, clock in enumerate(self.clock):
+            here = slots[:, i]
+            slope = (self.shape - np.matmul(here[:, None], self.shape)) * here[..., None]
+            bands = slope[:, :-1]
+            bands[self.own] += slope[:, -1]
+            bands = (bands * self.weight[:, i, None, None]).reshape(-1, size)
+            squares[i] = bands.T @ bands
+            pull += np.outer(bands.T @ missed[:, i].ravel(), clock)
+        matrix = np.einsum("tab,tc,td->acbd", squares, self.clock, self.clock, optimize=True)
+        index = self.held.ravel()
+        matrix = matrix.reshape(len(index), -1)[np.ix_(index, index)]
+        return matrix + RIDGE * np.eye(len(matrix)), (pull - RIDGE * table).ravel()[index]
+
+    def _bands(self, slots: np.ndarray) -> np.ndarray:
+        """The source's own tone added to its band, (source, time, band)."""
+        bands = slots[..., :-1].copy()
+        bands[self.own[0], :, self.own[1]] += slots[..., -1]
+        return bands
