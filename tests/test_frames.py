@@ -434,6 +434,8 @@ def test_contact_lists_of_lammps(motion, file):
     frames = read_frames(written, contacts=contacts)
     assert frames.contacts.pairs.tolist() == [[a - 1, b - 1] for a, b in RING]
     assert frames.contacts.overlap is None
+    named = file([part.replace("ENTRIES", "PAIRS") for part in local(RING)])  # dump_modify ... label PAIRS
+    assert torch.equal(read_frames(written, contacts=named).contacts.pairs, frames.contacts.pairs)
     columns = {"id1": "c_1[1]", "id2": "c_1[2]", "distance": "c_2[1]", "normal_force": "c_2[2]"}
     frames = read_frames(written, contacts=contacts, contact_columns=columns)
     assert (frames.contacts.overlap - 0.1).abs().max() < 1e-14

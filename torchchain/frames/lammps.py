@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,11 @@ class Header:
     count: int
     box: Box | None
     columns: tuple[str, ...]
+
+
+def lists_contacts(head: bytes) -> bool:
+    """Whether a file begins like a dump of pairs: of entries, or of what ``dump_modify label`` calls them."""
+    return head.lstrip().startswith(b"ITEM: ") and re.search(rb"ITEM: NUMBER OF (?!ATOMS)", head) is not None
 
 
 def where(name: str, number: int) -> str:
@@ -226,7 +232,7 @@ FORMAT = Format(
     holds="particles",
     summary="LAMMPS or LIGGGHTS text dump (dump custom or atom): x, xu, xs or xsu, image flags, any order of columns and rows",
     endings=(".dump", ".lammpstrj", ".lammpsdump", ".liggghts"),
-    recognizes=lambda head: head.lstrip().startswith(b"ITEM: ") and b"ITEM: ENTRIES" not in head,
+    recognizes=lambda head: head.lstrip().startswith(b"ITEM: ") and not lists_contacts(head),
     scan=_scan,
     read=_read,
 )

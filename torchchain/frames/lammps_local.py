@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchchain import checks
-from torchchain.frames.lammps import read_header, scan_dump, where
+from torchchain.frames.lammps import lists_contacts, read_header, scan_dump, where
 from torchchain.frames.registry import Entry, Format, Raw, Scan
 from torchchain.frames.text import Text, parse
 
@@ -108,7 +108,7 @@ FORMAT = Format(
     holds="contacts",
     summary="LAMMPS dump local with the ids of each pair (compute property/local patom1 patom2) and what else there is",
     endings=(),
-    recognizes=lambda head: b"ITEM: ENTRIES" in head,
+    recognizes=lists_contacts,
     scan=scan,
     read=read,
     options={"contact_columns": "dict from id1, id2, overlap, distance, normal_force to names of columns"},

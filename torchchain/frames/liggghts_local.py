@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from torchchain import checks
 from torchchain.frames import lammps_local
+from torchchain.frames.lammps import lists_contacts
 from torchchain.frames.lammps_local import can_be_ids, read_columns, scan, whole
 from torchchain.frames.registry import Entry, Format, Raw
 
@@ -85,7 +87,10 @@ def _ids(here: str, names: Sequence[str], values: list[np.ndarray]) -> int:
 
 
 def _one_compute(head: bytes) -> bool:
-    line = head.partition(b"ITEM: ENTRIES")[2].partition(b"\n")[0].split()
+    if not lists_contacts(head):
+        return False
+    found = re.search(rb"ITEM: NUMBER OF (\S+).*?ITEM: \1 ([^\n]*)", head, re.DOTALL)
+    line = found[2].split() if found else []
     return len(line) >= 3 and all(word.startswith(line[0].partition(b"[")[0] + b"[") for word in line)
 
 
