@@ -302,7 +302,7 @@ class Import(FileFlags):
     """LAMMPS or LIGGGHTS dumps, MercuryDPM .data, extended XYZ, netCDF of convert; plain or gzip"""
     reference: Annotated[str | None, flag("FILE", "the run's first frame")] = None
     """chain at rest: a file, as in "{stem}.reference.dump"; {name}: of the run, {stem}: without endings, {group}: and
-    without its last number; beside the run where no folder is named"""
+    without its last number, {1}: its first number; beside the run where no folder is named"""
     contacts: Annotated[str | None, flag("FILE|PATTERN")] = None
     """contact lists of a run, named like the reference"""
     boundary: Annotated[str, flag(choices.BOUNDARIES, "periodic")] = "periodic"

@@ -118,7 +118,9 @@ def _each_doubt_once() -> Iterator[None]:
 
 def _config(flags: Import, files: list[RunFiles]) -> str:
     """The flags as TOML, by which the import can be made again from any folder."""
-    given = {name: value for name, value in vars(flags).items() if value is not None and name not in ("out", "calibrate")}
+    given = {
+        name: value for name, value in vars(flags).items() if value is not None and name not in ("out", "calibrate")
+    }
     for name in ("reference", "contacts", "masses"):
         place = Path(given.get(name, ""))
         if place.parent != Path() or (name == "masses" and place.is_file()):
@@ -192,10 +194,13 @@ def _beside(field: str, template: str, run: Path) -> Path:
     """The path that a template means for a run, in the run's folder if it names none."""
     stem = re.sub(ENDINGS, "", run.name)
     parts = {"name": run.name, "stem": stem, "group": re.sub(r"[-_.]?\d+$", "", stem)}
+    parts |= {str(i): number for i, number in enumerate(re.findall(r"\d+", stem), 1)}
     unknown = [part for part in re.findall(r"{(.*?)}", template) if part not in parts]
     if unknown or not template:
         raise checks.fail(
-            field, "be a file name that holds no other braces than {name}, {stem}, {group}", repr(template)
+            field,
+            "be a file name that holds no other braces than {name}, {stem}, {group} and {1}, {2}, ... for the numbers in it",
+            repr(template),
         )
     name = re.sub(r"{(.*?)}", lambda found: parts[found[1]], template)
     return Path(name) if Path(name).parent != Path() else run.with_name(name)
@@ -294,9 +299,7 @@ def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Ch
         return frames, grains
     chains = []
     for run, each in zip(files, frames, strict=True):
-        chains.append(
-            each.chain(flags.boundary, stiffness, axis=flags.axis, damping=damping, reference=run.reference)
-        )
+        chains.append(each.chain(flags.boundary, stiffness, axis=flags.axis, damping=damping, reference=run.reference))
         check_bands(chains[-1].n_particles, _n_bands(flags, chains[-1]))
     return frames, chains
 

@@ -12,7 +12,7 @@ from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.frames.doubts import here, warn
 from torchchain.frames.order import check_contact_order, line_axis, line_order
-from torchchain.frames.record import AXES, Frame
+from torchchain.frames.record import Frame
 from torchchain.frames.units import LAWS, contact_stiffness, finite_masses
 
 FAR = 0.1  # of a mean mass from 1
@@ -42,7 +42,7 @@ def chain(
             f"their mean is {mean:.4g}, not 1: times are in other units than the library's (frames.scaled, or import --units mass, gives those)",
         )
     checks.choice("boundary", boundary, ("periodic", "fixed"))
-    periodic = frame.box is not None and frame.box.periodic[AXES.index(line)]
+    periodic = frame.box is not None and frame.box.period(line) > 0
     if boundary == "periodic" and frame.box is not None and not periodic:
         warn(f"{here(name, frame)}: box", f"not marked periodic along {line}, but the chain is to be")
     if isinstance(stiffness, str):

@@ -13,7 +13,7 @@ import numpy as np
 from torchchain import checks
 from torchchain.frames.record import AXES, Box
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import CutShort, Text, parse
+from torchchain.frames.text import CutShort, Text, gone, parse
 
 SAME = {"id": "id", "type": "type", "mass": "mass", "radius": "radius", "vx": "vx", "vy": "vy", "vz": "vz"}
 INTEGERS = {"id", "type", "ix", "iy", "iz"}
@@ -187,7 +187,7 @@ def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iter
             here = where(path.name, entry.number)
             header = read_header(text, entry.number, "ATOMS")
             if header is None:
-                raise checks.fail(here, "stay as it was when the file was opened", "its end")
+                raise gone(here)
             columns = header.columns
             wanted = {
                 name

@@ -12,7 +12,7 @@ import numpy as np
 from torchchain import checks
 from torchchain.frames.lammps import lists_contacts, read_header, scan_dump, where
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import Text, parse
+from torchchain.frames.text import Text, gone, parse
 
 FIELDS = ("id1", "id2", "overlap", "distance", "normal_force")
 PAIRS = (("id1", "id2"), ("patom1", "patom2"), ("natom1", "natom2"), ("batom1", "batom2"))
@@ -31,7 +31,7 @@ def read_columns(path: Path, entries: Iterable[Entry]) -> Iterator[tuple[str, Se
             here = where(path.name, entry.number)
             header = read_header(text, entry.number, "ENTRIES")
             if header is None:
-                raise checks.fail(here, "stay as it was when the file was opened", "its end")
+                raise gone(here)
             yield (
                 here,
                 header.columns,

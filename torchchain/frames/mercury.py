@@ -12,7 +12,7 @@ from torchchain import checks
 from torchchain.frames.lammps import where
 from torchchain.frames.record import Box
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import CutShort, Text, parse
+from torchchain.frames.text import CutShort, Text, gone, parse
 
 # A header of N, time and the corners of the domain: 2 + 4 numbers in two dimensions, 2 + 6 in three. A row is position,
 # velocity, radius, angle, angular velocity and one number of the user's (the species unless changed).
@@ -90,7 +90,7 @@ def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iter
             here = where(path.name, entry.number)
             header = _header(text, entry.number)
             if header is None:
-                raise checks.fail(here, "stay as it was when the file was opened", "its end")
+                raise gone(here)
             count, _, corners = header
             if columns is None and count:
                 columns = _columns(here, text, len(corners) // 2)

@@ -11,7 +11,7 @@ from torchchain import checks
 from torchchain.chain.states import Trajectory
 from torchchain.frames.doubts import check_across, check_bounds, check_digits, here, warn
 from torchchain.frames.order import check_contact_order, line_axis, line_order
-from torchchain.frames.record import AXES, Box, Frame
+from torchchain.frames.record import AXES, TIMED, Box, Frame
 from torchchain.memory import gigabytes, memory
 from torchchain.network import NetworkTrajectory
 
@@ -61,7 +61,7 @@ def displacements(
         if frame.time is None:
             raise checks.fail(
                 f"{here(name, frame)}: TIME",
-                "be in the file (LAMMPS: dump_modify ... time yes) or follow from time_step=",
+                TIMED,
                 "none",
             )
         u = frame.positions[order][:, columns] - rest
@@ -88,8 +88,7 @@ def displacements(
 
 
 def _period(box: Box | None, axis: str) -> float:
-    i = AXES.index(axis)
-    return float(box.lengths[i]) if box is not None and box.periodic[i] else 0.0
+    return 0.0 if box is None else box.period(axis)
 
 
 def _check_alike(name: str, first: Frame, reference: Frame, reference_name: str) -> None:

@@ -27,8 +27,8 @@ def line_axis(name: str, frame: Frame, axis: str | None) -> str | None:
     offset = frame.positions - frame.positions[:1]
     if frame.box is not None:
         for i, a in enumerate(frame.axes):
-            length = float(frame.box.lengths[AXES.index(a)])
-            if frame.box.periodic[AXES.index(a)] and length > 0:
+            length = frame.box.period(a)
+            if length > 0:
                 across = offset[:, i]
                 offset[:, i] = across - length * (across / length).round()
     for i, a in enumerate(frame.axes):
@@ -48,10 +48,9 @@ def line_order(name: str, frame: Frame, axis: str) -> Tensor:
     """
     column = frame.axes.index(axis)
     along = frame.positions[:, column]
-    if frame.box is not None and frame.box.periodic[AXES.index(axis)] and not frame.unwrapped[column]:
-        low, length = frame.box.lower[AXES.index(axis)], float(frame.box.lengths[AXES.index(axis)])
-        if length > 0:
-            along = low + (along - low).remainder(length)
+    if frame.box is not None and frame.box.period(axis) > 0 and not frame.unwrapped[column]:
+        low = frame.box.lower[AXES.index(axis)]
+        along = low + (along - low).remainder(frame.box.period(axis))
     sorted_along, order = along.sort(stable=True)
     same = (sorted_along.diff() == 0).nonzero()
     if len(same):

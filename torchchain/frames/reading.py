@@ -23,7 +23,7 @@ from torchchain.frames.doubts import check_energy, check_opening, here
 from torchchain.frames.motion import displacements
 from torchchain.frames.opening import File, Place, Source, find, time_of
 from torchchain.frames.packings import network as make_network
-from torchchain.frames.record import Box, Contacts, Frame
+from torchchain.frames.record import TIMED, Box, Contacts, Frame
 from torchchain.frames.registry import Entry, Raw
 from torchchain.frames.units import LAWS, ContactUnits, at_rest, fit_units, scaled_contacts
 from torchchain.network import Network, NetworkTrajectory
@@ -158,7 +158,7 @@ class Frames:
         if any(time is None for time in times):
             raise checks.fail(
                 f"{self.name}: TIME",
-                "be in the file (LAMMPS: dump_modify ... time yes) or follow from time_step=",
+                TIMED,
                 "none",
             )
         return torch.tensor(times, dtype=torch.float64) / self._unit("time")

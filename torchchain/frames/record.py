@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 AXES = ("x", "y", "z")
+TIMED = "be in the file (LAMMPS: dump_modify ... time yes) or follow from time_step="
+"""The rule for times."""
 
 
 class FramesWarning(UserWarning):
@@ -50,6 +52,11 @@ class Box:
     def lengths(self) -> Tensor:
         """Lengths of the sides, (3,)."""
         return torch.tensor(self.upper, dtype=torch.float64) - torch.tensor(self.lower, dtype=torch.float64)
+
+    def period(self, axis: str) -> float:
+        """The distance along "x", "y" or "z" after which what leaves comes in again; 0 where the box is not periodic."""
+        i = AXES.index(axis)
+        return self.upper[i] - self.lower[i] if self.periodic[i] else 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,11 @@ class CutShort(Exception):
         self.rows = rows
 
 
+def gone(here: str) -> checks.FieldError:
+    """The error for a frame that the first pass over its file found, and that is there no more."""
+    return checks.fail(here, "stay as it was when the file was opened", "its end")
+
+
 def readable(field: str, path: Path) -> Path:
     """The path, if it is a file with something in it that can be opened."""
     try:

@@ -92,9 +92,7 @@ def contact_stiffness(name: str, frame: Frame, law: str) -> Tensor:
 
 def periods(box: Box | None) -> Tensor:
     """Lengths of the box along x, y, z, infinite where it is not periodic, (3,)."""
-    if box is None:
-        return torch.full((3,), torch.inf, dtype=torch.float64)
-    return torch.where(torch.tensor(box.periodic) & (box.lengths > 0), box.lengths, torch.inf)
+    return torch.tensor([(box.period(axis) if box else 0) or torch.inf for axis in AXES], dtype=torch.float64)
 
 
 def separation(frame: Frame, pairs: Tensor) -> Tensor:

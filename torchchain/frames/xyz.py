@@ -15,7 +15,7 @@ from torchchain import checks
 from torchchain.frames.lammps import where
 from torchchain.frames.record import AXES, Box
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import CutShort, Text
+from torchchain.frames.text import CutShort, Text, gone
 
 NAMES = {
     "id": ("id", "ids", "particle_identifier"), "mass": ("mass", "masses"), "radius": ("radius", "radii"),
@@ -120,7 +120,7 @@ def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iter
             found = _frame(text, entry.number, ase, whole=True)
             here = where(path.name, entry.number)
             if found is None:
-                raise checks.fail(here, "stay as it was when the file was opened", "its end")
+                raise gone(here)
             yield _convert(here, found[1])
 
 
