@@ -4,6 +4,7 @@ from torchchain import frames as frames
 from torchchain import master as master
 from torchchain import mixing as mixing
 from torchchain import network as network
+from torchchain import species as species
 from torchchain import theory as theory
 from torchchain._version import __version__ as __version__
 from torchchain.chain import Chain as Chain

@@ -43,11 +43,12 @@ TOPICS: dict[str, tuple[str, str]] = {
     ),
     "parts": ("Parts of a calibration", "master.*"),
     "theory": ("Theory", "theory.*"),
+    "species": ("Mixtures of species", "species.*"),
     "mixing": ("Nonlinear contacts: energy that mixes bands", "mixing.*"),
     "frames": ("Frames of other codes", "read_frames Frames FramesWarning frames.*"),
     "networks": ("Networks: lattices and packings", "Network lattice packing network.*"),
 }
-ROOMS = ("chain", "energy", "ensemble", "frames", "master", "mixing", "network", "theory")
+ROOMS = ("chain", "energy", "ensemble", "frames", "master", "mixing", "network", "species", "theory")
 
 
 def public_names() -> dict[str, Any]:
