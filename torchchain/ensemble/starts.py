@@ -28,13 +28,13 @@ from torchchain.ensemble.statistics import merged
 
 FEWEST = 16
 """Independent samples of a scene from which on other starts are measured: of half of them."""
-TIMES = 31
+TIMES = 24
 """At most so many times above 0, evenly in their logarithm."""
 FIRST = 0.5
 """The first of them, where the scene's times are not earlier."""
-FINENESS = 8.0
+FINENESS = 4.0
 """Standard errors to the unit to which means are rounded, at least."""
-ERROR_BITS = 5
+ERROR_BITS = 4
 """Significant bits of a standard error."""
 KINDS = ("released", "kicked")
 
@@ -166,7 +166,7 @@ def start_transfer(
 
 
 def _rounded(mean: Tensor, stderr: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean to a power of two at most an eighth of its standard error, and that to a few bits: numbers of single precision."""
+    """Mean to a power of two at most a quarter of its standard error, and that to a few bits: numbers of single precision."""
     noisy = stderr.isfinite() & (stderr > QUIET)
     mantissa, exponent = torch.frexp(stderr)
     error = torch.ldexp((mantissa * 2.0**ERROR_BITS).round() / 2.0**ERROR_BITS, exponent)

@@ -371,7 +371,7 @@ class MasterEquation(Printed, nn.Module):
         if self.calibration.report.certificate is not None:  # sums of what is not negative; proved again all the same
             proof = certify(model)
             record = replace(record, report=replace(record.report, certificate=proof if proof.holds else None))
-        return MasterEquation(model, record, None if errors is None else errors.coarsened(joined.to(errors.stderr)))
+        return MasterEquation(model, record, None if errors is None else errors.coarsened(joined))
 
     def _joined_report(self, joined: Tensor) -> Report:
         loss = self.calibration.report.loss

@@ -80,7 +80,7 @@ class Uncertainty:
         mean = (joined / joined.sum(0)).T.square()
 
         def wider(error: Tensor) -> Tensor:
-            return torch.tensordot(mean, (error @ joined).square(), dims=1).sqrt()
+            return torch.tensordot(mean, (error.to(joined) @ joined).square(), dims=1).sqrt()
 
         return Uncertainty(wider(self.rates_stderr), wider(self.basis_stderr), self.times, wider(self.stderr))
 
@@ -149,7 +149,7 @@ def draw_again(
     )
     return Uncertainty(
         scale * torch.stack(rates).std(0), scale * torch.stack(bases).std(0), times,
-        (spread.square() + own.square()).sqrt(),
+        (spread.square() + own.square()).sqrt().float(),  # known to a few per cent
     )  # fmt: skip
 
 
