@@ -460,6 +460,14 @@ def test_import_calibrate_predict(run, tmp_path):
     assert "6 runs of 12 particles" in output
     assert run("predict", "model", "--times.stop", "10", "--out", "later")[0] == 0
     assert tc.open("model").master.n_bands == 3
+    # A prediction against the data: the same axes, at the times that both have.
+    status, output, errors = run("compare", "later", "model", "--out", "compared")
+    assert (status, errors) == (0, "")
+    assert "band_energy: 54 values, largest difference " in output
+    found = tc.open("compared").record["summary"]["band_energy"]
+    predicted = tc.open("model").master.transfer(transfer.times).detach()
+    expected = tc.total_variation(predicted, transfer.mean)[:, 1:].mean()
+    assert found["total_variation"] == pytest.approx(float(expected), abs=1e-9)
 
 
 @pytest.mark.usefixtures("no_drawing")

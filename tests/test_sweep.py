@@ -6,6 +6,7 @@ import json
 import pytest
 import xarray
 
+import torchchain as tc
 from torchchain import cli
 from torchchain.cli import outputs
 from torchchain.cli.compare import differing
@@ -70,6 +71,12 @@ def test_a_sweep_of_calibrations():
     assert not [name for name in whole.data_vars if name.startswith("block")]
     assert (whole["run_n_parameters"] == 16).all()
     assert (whole["run_tv"] > 0).all()
+    for point, horizon in zip((0.1, 0.3), whole["run_horizon"].values.ravel(), strict=True):  # infinite where the models settle
+        said = json.loads(open(f"s/runs/disorder.strength={point},calibration.model=paper/run.json").read())["numbers"]
+        assert float(said["horizon"]) == float(horizon)
+    opened = tc.open("s")
+    assert opened.scene is None
+    assert opened.data.identical(whole)
 
 
 @pytest.mark.parametrize(

@@ -60,9 +60,17 @@ def _read(name: str, path: str) -> tuple[xarray.Dataset, dict[str, Any]]:
     if not path:
         raise checks.fail(name, "be a file, or the folder of a run", repr(path))
     if not Path(path).is_dir():
-        return read_dataset(Path(path)), {}
+        return _by_source(read_dataset(Path(path))), {}
     folder = open_folder(path)
-    return folder.data, folder.config if (folder.path / "config.toml").is_file() else {}
+    return _by_source(folder.data), folder.config if (folder.path / "config.toml").is_file() else {}
+
+
+def _by_source(data: xarray.Dataset) -> xarray.Dataset:
+    """A prediction that starts in one band each, on the axes of the band transfer that it can be compared with."""
+    labels = data["start"].values.tolist() if "start" in data.dims else [""]
+    if not all(str(label).isdigit() for label in labels):
+        return data
+    return data.assign_coords(start=[int(label) for label in labels]).rename(start="source", band="receiver")
 
 
 def _figure(a: xarray.Dataset, b: xarray.Dataset, found: list[Agreement]) -> Any:
