@@ -1,4 +1,4 @@
-"""What the tests share: one thread, a cache of their own, a small ensemble."""
+"""What the tests share: one thread, a small ensemble."""
 
 import pytest
 import torch
@@ -15,14 +15,6 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def own_cache(tmp_path_factory):
-    """Speeds of the machine are neither read from nor left in the user's cache."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHCHAIN_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -13,20 +13,19 @@ import shutil
 import struct
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
 import torch
 import xarray
 from safetensors.torch import load_file, save_file
+from taken import LITTLE, Taken
 
 import torchchain as tc
 from torchchain import cli
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.cli import flags, outputs
 
-SOON = 10.0
 SMALL = "--n-particles 16 --n-bands 4 --realizations 4 --times.stop 6 --times.step 0.5 --method modes".split()
 B = 4
 
@@ -69,9 +68,7 @@ def run(tmp_path, monkeypatch, capsys):
 
     def command(*arguments):
         capsys.readouterr()
-        begin = time.perf_counter()
         status = cli.main([str(argument) for argument in arguments])
-        assert time.perf_counter() - begin < SOON
         return status, *capsys.readouterr()
 
     return command
@@ -209,7 +206,9 @@ def test_hostile_values_of_every_field(field, tmp_path):
     path, refused = tmp_path / "scene.toml", 0
     for value in TOML:
         path.write_text(config(field, value))
-        begin = time.perf_counter()
+        with Taken() as taken, contextlib.suppress(FieldError, FieldTypeError):
+            tc.Scene.from_toml(path)
+        assert taken.largest < LITTLE
         try:
             scene = tc.Scene.from_toml(path)
         except (FieldError, FieldTypeError) as error:
@@ -220,7 +219,6 @@ def test_hostile_values_of_every_field(field, tmp_path):
         else:  # a scene that says the same again
             assert tc.Scene.from_dict(scene.to_dict()).to_dict() == scene.to_dict()
             assert torch.isfinite(scene.times).all()
-        assert time.perf_counter() - begin < SOON
     assert refused >= 12
 
 
@@ -430,12 +428,11 @@ def write(path, header, outer, data):
 
 
 def refused(path, reader, match=None):
-    begin = time.perf_counter()
-    with pytest.raises((FieldError, FieldTypeError), match=match) as caught:
+    with Taken() as taken, pytest.raises((FieldError, FieldTypeError), match=match) as caught:
         reader.load(path)
     assert str(caught.value).startswith((f"file {path}", "members must"))
     assert "\n" not in str(caught.value)
-    assert time.perf_counter() - begin < SOON
+    assert taken.largest < LITTLE
 
 
 @pytest.fixture
@@ -670,11 +667,10 @@ DATASETS = {
 @pytest.mark.parametrize("name", DATASETS)
 def test_datasets_that_are_no_transfer(name, transfer):
     data = DATASETS[name](transfer.to_dataset())
-    begin = time.perf_counter()
-    with pytest.raises((FieldError, FieldTypeError)) as caught:
+    with Taken() as taken, pytest.raises((FieldError, FieldTypeError)) as caught:
         tc.BandTransfer.from_dataset(data)
     assert "\n" not in str(caught.value)
-    assert time.perf_counter() - begin < SOON
+    assert taken.largest < LITTLE
 
 
 def test_a_dataset_that_is_one(transfer, tmp_path):

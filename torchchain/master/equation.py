@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -243,8 +244,8 @@ class MasterEquation(Printed, nn.Module):
         if supply.ndim == 0 or supply.shape[-1] != self.n_bands or supply.shape[-2] not in (1, len(times)):
             raise checks.fail("supply", f"have shape {(self.n_bands,)} or (*batch, {shape[0]}, {shape[1]})", f"shape {tuple(supply.shape)}")  # fmt: skip
         try:
-            batch = torch.broadcast_shapes(supply.shape[:-2], initial.shape[:-1])
-        except RuntimeError:
+            batch = np.broadcast_shapes(supply.shape[:-2], initial.shape[:-1])
+        except ValueError:
             raise checks.fail("supply", f"fit a batch of {tuple(initial.shape[:-1])} starts", f"shape {tuple(supply.shape)}") from None  # fmt: skip
         return supply.expand(*batch, *shape)
 

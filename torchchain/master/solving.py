@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -103,7 +104,7 @@ def _ode(integrator: Integrator) -> Callable[..., Tensor]:
                     path = integrate(start, span, 0.0)
                 else:  # the supply jumps at the output times
                     fed = supply[..., -(len(span) - 1) :, :] @ parts.start
-                    states = [start.expand(torch.broadcast_shapes(start.shape, fed[..., 0, :].shape))]
+                    states = [start.expand(np.broadcast_shapes(start.shape, fed[..., 0, :].shape))]
                     for i in range(len(span) - 1):
                         states.append(integrate(states[-1], span[i : i + 2], fed[..., i, :])[-1])
                     path = torch.stack(states)
