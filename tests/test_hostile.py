@@ -424,7 +424,7 @@ def test_what_cannot_fit_is_refused_with_the_estimate(call, field):
 
 def test_what_is_taken_is_counted():
     with Taken() as by_torch:
-        torch.zeros(10**6)
+        torch.zeros(10**7)
     with Taken() as by_numpy:
-        np.zeros(10**6)
-    assert (by_torch.largest, by_numpy.largest // 10**6) == (4 * 10**6, 8)
+        np.zeros(10**7)
+    assert (by_torch.largest, by_numpy.largest // 10**7) == (4 * 10**7, 8)
