@@ -103,7 +103,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     figure, axes = harness.panels(1, 2, width=6.4, height=5.2)
     _errors(axes[0, 0], data)
     _costs(axes[0, 1], data)
-    figure.suptitle(f"$\\xi$ = {config.strength:g}, {config.realizations} chains, 0 < t <= {config.stop:g}")
+    figure.suptitle(f"$\\xi$ = {config.strength:g}, {config.realizations} chains, 0 < $t$ ≤ {config.stop:g}")
     return figure
 
 

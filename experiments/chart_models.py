@@ -123,7 +123,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     handles += [axes[0, 0].plot([], [], "k:", label="two ensembles of chains")[0]]
     figure.legend(handles=handles, loc="outside right upper", fontsize="small")
     figure.suptitle(
-        f"$\\xi$ = {config.strength:g}, {config.realizations} chains of {config.n_particles}, 0 < t <= {config.stop:g}"
+        f"$\\xi$ = {config.strength:g}, {config.realizations} chains of {config.n_particles}, 0 < $t$ ≤ {config.stop:g}"
     )
     return figure
 

@@ -141,7 +141,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
             ratio(axes[1, i], data.isel(strength=i), part, style)
             plots.curve(axes[2, i], data.ring_time.values, part.share.values, part.share_stderr.values, **style)
             plots.curve(axes[3, i], data.band.values, part.long_time.values, part.long_time_stderr.values, **style)
-        axes[0, i].set(xlabel=plots.TIME_LABEL, ylabel="center of energy R", title=f"$\\xi$ = {xi:g}")
+        axes[0, i].set(xlabel=plots.TIME_LABEL, ylabel="center of energy $R$", title=f"$\\xi$ = {xi:g}")
         axes[1, i].set(
             xlabel=plots.TIME_LABEL, ylabel="r$^2$ / that of normal masses", xlim=(config.early, config.stop)
         )

@@ -148,7 +148,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
             ax.plot(front[0], front[1], "kv", ms=4, mfc="none")
         if xi == 0:
             ax.plot([], [], "k--", lw=0.8, label="group velocities")
-        ax.set(xlabel="particle p", ylabel="mean energy / energy of the kick", yscale="log", title=f"$\\xi$ = {xi:g}")
+        ax.set(xlabel="particle $p$", ylabel="mean energy / energy of kick", yscale="log", title=f"$\\xi$ = {xi:g}")
         ax.set(xlim=(-0.02 * config.n_particles, config.n_particles), ylim=(1e-6, 10 * float(data.energy.max())))
         ax.legend(fontsize="small", loc="upper center", ncols=len(config.times) // 2 + 1)
     figure.suptitle(

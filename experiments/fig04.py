@@ -162,7 +162,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         ends = np.array(config.window)
         left.plot(ends, fit(ends), "k--", lw=0.8)
     left.plot([], [], "k--", lw=0.8, label="power laws")
-    left.set(xlabel="particle p", ylabel="mean energy / energy of the kick", xscale="log", yscale="log")
+    left.set(xlabel="particle $p$", ylabel="mean energy / energy of kick", xscale="log", yscale="log")
     left.legend(fontsize="small")
     plots.exponents(right, np.array(config.strengths), fits, "disorder $\\xi$")
     right.axhline(-2.5, color="k", lw=0.8, ls=":", label="infinite chain, infinite time: $-5/2$")

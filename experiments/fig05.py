@@ -85,7 +85,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         color = "k" if xi == 0 else f"C{i - 1}"
         plots.curve(left, data.time.values, part.energy.values, part.energy_stderr.values, color=color, lw=0.9,
                     label=f"$\\xi$ = {xi:g}")  # fmt: skip
-    left.set(xlabel=plots.TIME_LABEL, ylabel="mean energy / energy of the kick", xscale="log", yscale="log",
+    left.set(xlabel=plots.TIME_LABEL, ylabel="mean energy / energy of kick", xscale="log", yscale="log",
              title=f"(a) particle {config.site}", xlim=(0.1, None), ylim=(1e-6, 2))  # fmt: skip
     left.legend(fontsize="small", loc="lower left")
     strengths = np.array(config.strengths)

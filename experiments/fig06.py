@@ -67,14 +67,14 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         plots.curve(
             inset, times[early], part.center.values[early], part.center_stderr.values[early], color=f"C{i}", lw=0.9
         )
-    ax.plot(times, BALLISTIC * times, "k:", lw=0.9, label="32 t / (15 $\\pi$)")
+    ax.plot(times, BALLISTIC * times, "k:", lw=0.9, label="32 $t$ / (15 $\\pi$)")
     inset.axhline(1.0, color="k", lw=0.5)
     inset.set_title("early times", fontsize="small")
     inset.tick_params(labelsize="small")
     top = float(data.center.max())
     ax.set(
         xlabel=plots.TIME_LABEL,
-        ylabel="center of energy R / particle distance",
+        ylabel="center of energy $R$ / particle distance",
         xlim=(0, config.stop),
         ylim=(0, 1.05 * top),
     )

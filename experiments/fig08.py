@@ -96,7 +96,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
             ratio = part.asymmetry.values / part.asymmetry_stderr.values
             lower.plot(data.bin.values, ratio, marker, color=look["color"], ms=4, mfc="none", label=look["label"])
         upper.set(
-            xlabel="particle p", ylabel="mean energy / energy of the kick", yscale="log", title=f"$\\xi$ = {xi:g}"
+            xlabel="particle $p$", ylabel="mean energy / energy of kick", yscale="log", title=f"$\\xi$ = {xi:g}"
         )
         upper.set(xlim=(1, config.n_particles), ylim=(1e-6, 20 * float(data.energy.isel(strength=i).max())))
         upper.legend(fontsize="small", loc="upper left")

@@ -80,11 +80,11 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(1, len(CASES))
+    figure, axes = harness.panels(1, len(CASES), height=5.4)
     for ax, case, title in zip(axes[0], CASES, TITLES, strict=True):
         plots.field_map(
-            ax, data.particle.values, data.time.values, data.displacement.sel(case=case).values.T, "particle p",
-            plots.TIME_LABEL, "displacement u / initial overlap", "", config.amplitude, signed=True,
+            ax, data.particle.values, data.time.values, data.displacement.sel(case=case).values.T, "particle $p$",
+            plots.TIME_LABEL, "displacement $u$ (overlaps)", "", config.amplitude, signed=True,
         )  # fmt: skip
         ax.set_title(title.format(config.strength), pad=12)
         mark_lightest(ax, data.mass.sel(case=case).values)

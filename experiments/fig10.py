@@ -15,12 +15,12 @@ from torchchain import plots
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(1, len(CASES))
+    figure, axes = harness.panels(1, len(CASES), height=5.4)
     for ax, case, title in zip(axes[0], CASES, TITLES, strict=True):
         energy = data.energy.sel(case=case).values
         plots.log_map(
-            ax, data.particle.values, data.time.values, energy.T / energy.sum(-1).mean(), "particle p", plots.TIME_LABEL,
-            "share of the energy TE", floor=1e-4, top=1e-1,
+            ax, data.particle.values, data.time.values, energy.T / energy.sum(-1).mean(), "particle $p$", plots.TIME_LABEL,
+            "share of the energy $TE$", floor=1e-4, top=1e-1,
         )  # fmt: skip
         ax.set_title(title.format(config.strength), pad=12)
         mark_lightest(ax, data.mass.sel(case=case).values)

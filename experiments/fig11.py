@@ -43,7 +43,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     for ax, tone, letter in zip(axes[0], config.tones, "abcdef", strict=False):
         k = 2 * np.pi * tone / config.n_particles
         plots.log_map(
-            ax, data.time.values, data.wavenumber.values, share(data, tone), plots.TIME_LABEL, "wavenumber k",
+            ax, data.time.values, data.wavenumber.values, share(data, tone), plots.TIME_LABEL, "wavenumber $k$",
             "share of the energy $TE^{(k)}$", f"({letter}) tone {tone}, $k_{{ins}}$ = {k:.3f}", floor=1e-4,
         )  # fmt: skip
     figure.suptitle(f"a single chain, $\\xi$ = {config.strength:g}")

@@ -157,10 +157,11 @@ def _dataset(
 def draw(data: xarray.Dataset, config: Config) -> Figure:
     figure, axes = harness.panels(len(config.fit_steps), 2)
     for row, dt in zip(axes, config.fit_steps, strict=True):
-        for ax, band, letter in zip(row, data.band.values, "ab", strict=True):
+        for ax, band in zip(row, data.band.values, strict=True):
             _panel(ax, data.sel(band=band, fit_step=dt), config)
             kind = "decay of the source" if band == config.source else "rise of a receiver:"
-            ax.set_title(f"({letter}) {kind} band {band}, $\\Delta t$ = {dt:g}")
+            ax.set_title(f"{kind} band {band}, $\\Delta t$ = {dt:g}")
+    plots.lettered(axes.flat)
     figure.suptitle(f"source band {config.source} (tone {data.tone}), $\\xi$ = {config.strength:g}")
     return figure
 

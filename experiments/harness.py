@@ -131,7 +131,7 @@ def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
     data = script.measure(flags.settings, flags.device)
     stages["measure"] = time.time() - began
     rows = script.compare(data, flags.settings)
-    figure, report = _drawn(script, data, flags.settings), _report(script, data, flags.settings, rows)
+    figure, report = drawn(script, data, flags.settings), _report(script, data, flags.settings, rows)
     stages["figure and table"] = time.time() - began - stages["measure"]
     config = _toml(flags.settings)
     outputs.write(
@@ -157,7 +157,7 @@ def _redraw(script: Script, flags: Any, out: Path) -> None:
         data = file.load()
     rows = script.compare(data, flags.settings)
     report = _report(script, data, flags.settings, rows)
-    figure = _drawn(script, data, flags.settings)
+    figure = drawn(script, data, flags.settings)
     outputs.write(out, {**outputs.figures(figure, flags.format), "report.txt": outputs.text(report)})  # the rest stays
     print(report, end="")
     print(f"redrawn in {out}")
@@ -238,9 +238,12 @@ def _table(rows: list[Row]) -> dict[str, Any]:
     }
 
 
-def _drawn(script: Script, data: xarray.Dataset, config: Any) -> Figure:
+def drawn(script: Script, data: xarray.Dataset, config: Any) -> Figure:
+    """The figure in the sizes of print, legends off the data."""
     with plots.style():
-        return script.draw(data, config)
+        figure = script.draw(data, config)
+        plots.legends_below(figure)
+    return figure
 
 
 def changed(script: Script, config: Any) -> list[str]:

@@ -109,7 +109,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     axis.plot(data.strength, data.two, "k:", label=f"two ensembles of {config.realizations}")
     axis.set(
         xlabel=r"disorder $\xi$", ylabel="total variation from fresh lattices", yscale="log",
-        title=f"{config.size} x {config.size} {config.lattice}, {config.n_bands} bands, 0 < t <= {config.stop:g}",
+        title=f"{config.size} x {config.size} {config.lattice}, {config.n_bands} bands, 0 < $t$ ≤ {config.stop:g}",
     )  # fmt: skip
     axis.legend(fontsize="small")
     return figure

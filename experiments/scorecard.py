@@ -214,7 +214,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     _coverage(axes[0, 2], main)
     figure.suptitle(
         f"calibrated on {config.realizations} chains, scored on {config.fresh_realizations} others: "
-        f"N = {config.n_particles}, {config.n_bands} bands, 0 < t <= {config.stop:g}",
+        f"N = {config.n_particles}, {config.n_bands} bands, 0 < $t$ ≤ {config.stop:g}",
         fontsize="medium",
     )
     return figure

@@ -254,7 +254,7 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
     rows, mean = [], _mean_error(data, config)
     worst = data.error[0].idxmax("time").values
     for i, xi in enumerate(config.strengths):
-        label = f"xi = {xi:g}"
+        label = f"$\\xi$ = {xi:g}"
         rows += [
             Row(f"{label}: theory, mean over times", float(mean[0, i]), note=f"chains' own {float(data.noise[i, -1]):.4f}"),
             Row(f"{label}: theory, infinite time", float(data.late_error[0, i]), note=f"chains' own {float(data.late_noise[i]):.4f}"),

@@ -46,6 +46,24 @@ def lettered(axes: Iterable[Axes]) -> None:
         ax.set_title(f"({letter}) {ax.get_title('left')}".rstrip(), loc="left")
 
 
+def legends_below(figure: Any, columns: int = 2) -> None:
+    """Every legend that lies on data comes below its axes, and the figure grows by what that takes."""
+    rows: dict[int, int] = {}
+    for ax in figure.axes:
+        found = ax.get_legend()
+        if found is None or found.get_bbox_to_anchor() is not ax.bbox:
+            continue
+        labels = [text.get_text() for text in found.get_texts()]
+        widest = max(map(len, labels))
+        across = 1 if widest > 24 else columns if widest > 10 else columns + 1
+        title = found.get_title().get_text()
+        legend(ax, across, handles=found.legend_handles, labels=labels, **({"title": title, "title_fontsize": 7} if title else {}))
+        where = ax.get_subplotspec()
+        row = 0 if where is None else where.rowspan.start
+        rows[row] = max(rows.get(row, 0), -(-len(labels) // across) + bool(title))
+    figure.set_figheight(figure.get_figheight() + 0.14 * sum(rows.values()))
+
+
 def legend(ax: Axes, columns: int = 2, **where: Any) -> None:
     """A legend below the axes, off the data."""
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.3, ncols=columns, **where)

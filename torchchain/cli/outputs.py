@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from torchchain import checks
+from torchchain import checks, plots
 from torchchain.cli import report
 from torchchain.ensemble.ranks import rank_of_environment
 from torchchain.locks import lock
@@ -171,7 +171,8 @@ def figure(drawn: Any) -> Writer:
     """A writer of a matplotlib figure, in the format of the file's ending."""
 
     def writer(path: Path) -> None:
-        drawn.savefig(path, dpi=200)
+        with plots.style():  # colors and ticks are made as it is drawn
+            drawn.savefig(path, dpi=200)
 
     return writer
 
