@@ -112,8 +112,15 @@ def start_energy(chain: Chain, state: State) -> StartEnergy:
     kinetic = fold * (speed.real.square() + speed.imag.square())
     virial = fold * (place.real * speed.real + place.imag * speed.imag)
     stiffness, mass = _ratio(bound, potential.sum(-1)), _ratio(whole - bound, kinetic.sum(-1))
-    moving = mass[..., None] * kinetic
-    return StartEnergy((stiffness[..., None] * potential)[..., 1:], moving[..., 1:], (mass[..., None] * virial)[..., 1:], moving[..., 0])  # fmt: skip
+    # What the transforms' rounding leaves at tones without energy is none, nor is a virial of it.
+    blurred = 64 * torch.finfo(whole.dtype).eps
+    potential, kinetic = (
+        size[..., None] * torch.where(x > blurred**2 * x.amax(-1, keepdim=True), x, torch.zeros_like(x))
+        for size, x in ((stiffness, potential), (mass, kinetic))
+    )  # fmt: skip
+    virial = torch.where(virial.abs() > blurred * fold * place.abs() * speed.abs(), virial, torch.zeros_like(virial))
+    virial = mass[..., None] * virial * (kinetic > 0)
+    return StartEnergy(potential[..., 1:], kinetic[..., 1:], virial[..., 1:], kinetic[..., 0])
 
 
 def _ratio(part: Tensor, whole: Tensor) -> Tensor:

@@ -119,7 +119,9 @@ def scattered(w: Tensor, other: Tensor, rate: Tensor, times: Tensor, kicked: boo
         rise, ending = squared / settled, late
     else:  # t^4 w w' / 6 at first, and a Lorentzian in the end
         size, late = w * other, last_near - last_far
-        beat = torch.where(t < SERIES, _early(slow, fast, rate, t.clamp(max=SERIES)), near - far)
+        beat, first = near - far, finite & (t < SERIES)
+        if bool(first.any()):
+            beat[..., first] = _early(slow, fast, rate, t[first])
         rise = squared**2 * w * other / 6 / ((1 + squared * fast**2 / 12) * settled)
         ending = 4 * w * other / (fast**2 * (slow**2 + rate**2))
     beat = torch.where(finite, beat, late)
