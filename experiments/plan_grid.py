@@ -24,7 +24,7 @@ from torchchain.ensemble.scene import describe, regular_times
 from torchchain.evolvers import METHODS
 
 IN_SPACE = ("center", "width", "energy", "displacement", "total_energy", "source_energy")
-LAWS = ("linear",) * 12 + ("damped",) * 3 + ("hertz",) * 4 + ("hertz damped",)
+LAWS = ("linear",) * 10 + ("auto",) * 2 + ("damped",) * 3 + ("hertz",) * 4 + ("hertz damped",)
 STIFFNESS = (None, tc.Disorder("gamma", 1.0), None, tc.Disorder("lognormal", 0.9), None)  # of the scenes, by twenties
 WAYS = (
     "modes", "tridiagonal", "chebyshev", "verlet", "verlet float32", "symplectic4", "symplectic4 float32", "damped",
@@ -69,7 +69,7 @@ def varied(config: Config, number: int) -> tc.Scene:
     tolerance = draw.choice([1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 0.0])
     if law != "linear" and tolerance > 0:
         tolerance = max(tolerance, 1e-8)
-    bands = not hertz and draw.random() < 0.4
+    bands = not hertz and law != "auto" and draw.random() < 0.4
     wave, n_bands = bands or draw.random() < 0.5, int(draw.choice([4, 8, 16]))
     names = ("band_energy",) if bands else tuple(map(str, draw.choice(IN_SPACE, int(draw.choice([1, 2])), False)))
     n = max(2, n // (2 * n_bands)) * 2 * n_bands if bands else n
@@ -86,11 +86,15 @@ def varied(config: Config, number: int) -> tc.Scene:
     if realizations < 1:
         end = max(10.0, end * realizations)
     realizations = max(2 if tolerance == 0 else 1, int(realizations))
+    if law == "auto":  # from where linear contacts will do to where they will not
+        tolerance, size = max(tolerance, 1e-4), 10 ** draw.uniform(-4, -0.7)
+        excitation = replace(excitation, **{"amplitude" if wave else "velocity": size})
     return tc.Scene(
         n_particles=n, boundary=boundary, disorder=tc.Disorder(strength=strength), excitation=excitation,
         times=torch.tensor([end]) if count == 1 else regular_times(0.0, end, end / (count - 1)), n_bands=n_bands,
         realizations=realizations, seed=config.seed, tolerance=float(tolerance) or None, observables=names,
-        contact="hertz" if hertz else "linear", damping=damping, stiffness_disorder=stiffness,
+        contact="hertz" if hertz else "auto" if law == "auto" else "linear", damping=damping,
+        stiffness_disorder=stiffness, energy_definition="bond" if law == "auto" else "site",
     )  # fmt: skip
 
 
@@ -189,6 +193,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
         begin = time.perf_counter()
         plan = planning.plan(scene)
         plan_seconds.append(time.perf_counter() - begin)
+        true = replace(scene, contact="hertz") if scene.contact == "auto" else scene
         fastest = min(choice.predicted_seconds for choice in plan.choices)
         for choice in plan.choices:
             at = i, WAYS.index(way_of(choice))
@@ -202,18 +207,20 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             if choice.good and choice.predicted_seconds <= max(config.patience, 10 * fastest)
         ]
         exact: dict[str, xarray.Dataset] = {}
-        by = references(scene)
-        for name, (spent, result) in timed(scene, run_now, config.repeats, config.within).items():
+        by = references(true)
+        for name, (spent, result) in timed(plan.scene, run_now, config.repeats, config.within).items():
             reference = by.get(name.partition(" ")[0], by[""])
             if reference.method not in exact:
-                exact[reference.method] = run(scene, reference)
+                exact[reference.method] = run(true, reference)
             at = i, WAYS.index(name)
             table["seconds"][at] = spent
             table["reference_error"][at] = reference.predicted_error
             table["error"][at] = error(result, exact[reference.method], scene.observables)
         chosen.append(WAYS.index(way_of(plan.choices[0])))
         tolerances.append(plan.tolerance)
-        words.append(f"{describe(scene)}, {', '.join(scene.observables)}, {scene.contact}, damping {scene.damping:g}")
+        words.append(
+            f"{describe(scene)}, {', '.join(scene.observables)}, {scene.contact} contacts, in the run {plan.scene.contact}, damping {scene.damping:g}"
+        )
     return xarray.Dataset(
         {
             **{

@@ -125,6 +125,22 @@ def test_predicted_errors_are_bounds(fields, tolerance):
             assert error <= choice.predicted_error, (choice, error)
 
 
+@pytest.mark.parametrize("contact", ["linear", "hertz"])
+@pytest.mark.parametrize(
+    "excitation", [tc.StandingWave((11,), 2e-4), tc.StandingWave((17,), 2e-4), tc.Impulse(1, 2e-3)]
+)
+def test_swings_of_the_total_energy_keep_to_the_tolerance(excitation, contact):
+    """A composition's energy swings by more than its phases are off."""
+    wanted = scene(
+        n_particles=36, excitation=excitation, times=regular_times(0.0, 100.0, 3.0), tolerance=1e-3, contact=contact,
+        disorder=tc.Disorder(strength=0.3), observables=("total_energy",), boundary="periodic", energy_definition="bond",
+    )  # fmt: skip
+    for choice in plan(wanted).choices:
+        if choice.method in ("verlet", "symplectic4") and choice.dtype == torch.float64:
+            found = tc.simulate(replace(wanted, realizations=1), choice.method, options=choice.options).total_energy
+            assert float(abs(found / found[..., 0] - 1).max()) <= choice.predicted_error <= 1e-3
+
+
 def test_without_a_tolerance_the_ensemble_sets_it():
     few, many = (plan(scene(realizations=r)) for r in (4, 400))
     assert few.tolerance == pytest.approx(10 * many.tolerance)
@@ -178,6 +194,24 @@ def test_contact_law_follows_the_amplitude(velocity, law):
         assert float(abs(found.energy - hertz.energy).max() / hertz.energy.max()) < 1e-2
     else:
         assert 'contact = "hertz"' in tc.simulate(wanted).attrs["scene"]
+
+
+def test_contact_and_method_share_the_tolerance():
+    """What linear contacts leave out counts into the predicted error, and the method has the rest of the tolerance."""
+    wave = {"excitation": tc.StandingWave((8,), 0.002), "observables": ("energy",), "energy_definition": "bond"}
+    alone = plan(scene(**wave, tolerance=1e-2))
+    off = predictions.Facts(alone.scene).accumulated
+    assert plan(scene(**wave, contact="auto", tolerance=off / 0.99)).scene.contact == "hertz"
+    planned = plan(scene(**wave, contact="auto", tolerance=off / 0.85))
+    assert planned.scene.contact == "linear"
+    assert off < planned.predicted_error <= planned.tolerance
+    step = {choice.method: choice.options["step"] for choice in planned.choices if "step" in choice.options}
+    free = {
+        choice.method: choice.options["step"]
+        for choice in plan(scene(**wave, tolerance=off / 0.85)).choices
+        if "step" in choice.options
+    }
+    assert all(step[name] < free[name] for name in step)
 
 
 def test_hertz_by_amplitude_has_no_bands():

@@ -23,6 +23,7 @@ from torchchain.threads import single_thread
 ARTIFACT = "master equation"
 ORDERED_TOLERANCE = 1e-9
 FRACTION_OF_NOISE = 1 / 3  # adds 5 % to the statistical error
+CONTACT_FRACTION = 0.9  # of the tolerance that linear contacts may take up; the method has the rest
 SMALL_WORK = 0.008  # seconds of work that are not worth loading compiled kernels for, which takes half a second
 RUN_SECONDS = 3e-3  # of any run
 CPU = torch.device("cpu")
@@ -149,7 +150,7 @@ def plan(scene: Scene, stand_in: StandIn | None = None) -> Plan:
 def _plan(scene: Scene, stand_in: StandIn | None) -> Plan:
     facts = facts_of(scene if scene.contact != "auto" else replace(scene, contact="linear"))
     tolerance, reasons = _tolerance(scene)
-    scene, facts, why = _settled(scene, facts, tolerance)
+    scene, facts, why, off = _settled(scene, facts, tolerance)
     layouts = {name: _layout(name, scene) for name in scene.methods if _can(name, scene)}
     usable = {name: found for name, found in layouts.items() if found is not None}
     if not usable:
@@ -157,9 +158,9 @@ def _plan(scene: Scene, stand_in: StandIn | None) -> Plan:
     choices = []
     for name, cut in usable.items():
         for dtype in (torch.float64, torch.float32)[: 1 + scene.methods[name].single_precision]:
-            options, error = settle(name, facts, tolerance, dtype)
+            options, error = settle(name, facts, tolerance - off, dtype)
             work, seconds = _seconds(name, facts, options, dtype, cut)
-            choices.append(Choice(name, options, error, work, seconds, tolerance, dtype))
+            choices.append(Choice(name, options, error + off, work, seconds, tolerance, dtype))
     remarks: list[str] = []
     if stand_in is not None:
         found, remarks = stand_in(scene, tolerance)
@@ -272,10 +273,10 @@ def _tolerance(scene: Scene) -> tuple[float, list[str]]:
 
 def _settled(
     scene: Scene, facts: Facts | LatticeFacts, tolerance: float
-) -> tuple[Scene, Facts | LatticeFacts, list[str]]:
-    """The scene with its contact law, what it takes, and why."""
+) -> tuple[Scene, Facts | LatticeFacts, list[str], float]:
+    """The scene with its contact law, what it takes, why, and the error that the law chosen makes already."""
     if isinstance(facts, LatticeFacts):
-        return scene, facts, [f"lattices of {facts.n} unknowns and {facts.n_bonds} bonds"]
+        return scene, facts, [f"lattices of {facts.n} unknowns and {facts.n_bonds} bonds"], 0.0
     size = f"elongation about {facts.elongation:.1e} of the overlap, force off by {100 * facts.deviation:.1e} %"
     if scene.contact != "auto":
         return (
@@ -285,13 +286,14 @@ def _settled(
                 f"{scene.contact.capitalize()} contacts asked for: {size}"
                 + (" by linear ones" if scene.contact == "hertz" else " from Hertz contacts")
             ],
+            0.0,
         )
     off = facts.accumulated
     growing = f"{size} and energies by up to {off:.1e} at the last time"
-    if off <= tolerance:
-        return replace(scene, contact="linear"), facts, [f"linear contacts: {growing}, within the tolerance"]
+    if off <= CONTACT_FRACTION * tolerance:
+        return replace(scene, contact="linear"), facts, [f"linear contacts: {growing}, within the tolerance"], off
     scene = replace(scene, contact="hertz")
-    return scene, Facts(scene), [f"Hertz contacts: with linear ones {growing}, more than the tolerance"]
+    return scene, Facts(scene), [f"Hertz contacts: with linear ones {growing}, more than the tolerance allows"], 0.0
 
 
 def _can(name: str, scene: Scene) -> bool:

@@ -208,7 +208,8 @@ def _step_error(entry: Method, facts: Facts) -> float:
     """
     assert entry.order_in_step is not None
     if facts.scene.observables == ("total_energy",) and facts.scene.damping == 0:
-        return 18 * entry.phase_error * facts.frequency(entry.order_in_step)
+        swing = 6 * entry.phase_error if math.isnan(entry.energy_error) else entry.energy_error
+        return 3 * swing * facts.frequency(entry.order_in_step)
     margin = 5 if "displacement" in facts.scene.observables else 3
     return margin * entry.phase_error * facts.frequency(entry.order_in_step + 1) * max(facts.growing, 1.0)
 

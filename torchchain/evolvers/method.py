@@ -33,6 +33,7 @@ class Method:
         matrices: how many arrays of n_particles^2 numbers it holds per realization.
         order_in_step: for a method with a ``step``, the order of its error in it; else None.
         phase_error: c of the error c w^(order + 1) step^order t of a mode of frequency w; nan where it is not known.
+        energy_error: c of the largest error c (w step)^order of a mode's energy, which swings; nan where it is not known.
         forces_per_step: evaluations of the contact forces in a step.
         stability_limit: largest stable w_max step; None where no step is limited, or none is stable.
 
@@ -60,6 +61,7 @@ class Method:
     matrices: int = 0
     order_in_step: int | None = None
     phase_error: float = float("nan")
+    energy_error: float = float("nan")
     forces_per_step: int = 1
     stability_limit: float | None = None
 

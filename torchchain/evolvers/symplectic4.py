@@ -42,6 +42,7 @@ METHOD = Method(
     compiled=True,
     order_in_step=4,
     phase_error=6e-5,
+    energy_error=3.4e-3,
     forces_per_step=4,
     stability_limit=PEFRL.limit,
     options={"step": "largest step; outputs are reached by equal steps of at most that (default 0.4 / w_max)"},

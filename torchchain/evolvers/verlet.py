@@ -32,6 +32,7 @@ METHOD = Method(
     compiled=True,
     order_in_step=2,
     phase_error=1 / 24,
+    energy_error=1 / 4,
     forces_per_step=1,
     stability_limit=VERLET.limit,
     damped=True,
