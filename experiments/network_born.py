@@ -35,7 +35,7 @@ class Config:
     """disorders xi, of uniformly distributed masses"""
     square_scalar: tuple[float, ...] = (0.1, 0.12, 0.145, 0.17, 0.2, 0.23)
     """wavelengths per spacing of the waves along an axis"""
-    triangular_longitudinal: tuple[float, ...] = (0.08, 0.095, 0.11, 0.125, 0.145, 0.165)
+    triangular_longitudinal: tuple[float, ...] = (0.0688, 0.075, 0.0875, 0.1, 0.1125, 0.125)
     """the same along a bond"""
     triangular_transverse: tuple[float, ...] = (0.11, 0.13, 0.155, 0.18, 0.21, 0.25)
     """the same along a bond"""
@@ -43,9 +43,9 @@ class Config:
     """below this disorder the waves are shorter: in lines so narrow that few modes of the lattice lie in them, nothing decays"""
     square_scalar_weak: tuple[float, ...] = (0.145, 0.165, 0.19, 0.215, 0.245, 0.275)
     """wavelengths per spacing at weak disorder"""
-    triangular_longitudinal_weak: tuple[float, ...] = (0.11, 0.12, 0.13, 0.14, 0.155, 0.17)
+    triangular_longitudinal_weak: tuple[float, ...] = (0.0875, 0.09375, 0.1, 0.10625, 0.11875, 0.125)
     """the same along a bond"""
-    triangular_transverse_weak: tuple[float, ...] = (0.18, 0.2, 0.22, 0.24, 0.26, 0.285)
+    triangular_transverse_weak: tuple[float, ...] = (0.1375, 0.15, 0.1625, 0.175, 0.19375, 0.2125)
     """the same along a bond"""
     begin: float = 0.1
     """the slope is taken from this share of a decay time on"""
