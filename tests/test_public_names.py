@@ -27,6 +27,7 @@ def test_names_the_design_promises():
         band_energy long_time_band_energy Impulse StandingWave Scene simulate band_transfer BandTransfer calibrate
         MasterEquation plan Plan""".split()
     assert set(promised) <= set(tc.__all__)
+    assert len(tc.__all__) < 40, "everyday names only: the others belong to a room"
 
 
 def test_unknown_names():
@@ -59,6 +60,9 @@ def test_rooms_as_namespaces():
     assert tc.localization.lyapunov_exponent is tc.lyapunov_exponent
     assert tc.energy.energy_center is tc.energy_center
     assert tc.master.chapman_kolmogorov is tc.chapman_kolmogorov
+    assert tc.evolvers.METHODS is tc.METHODS
+    assert tc.ensemble.total_variation is tc.total_variation
+    assert {"chain", "energy", "evolvers", "localization", "master", "network", "theory"} <= set(dir(tc))
 
 
 SCRIPT = """

@@ -14,18 +14,20 @@ if TYPE_CHECKING:
 
 
 def _read_names() -> None:
-    """The public names, and for each name that resolves its module and what it is called there."""
+    """The names at the top, the rooms of all others, and for each name that resolves its module and what it is called there."""
     import ast
     from pathlib import Path
 
     shown: list[str] = []
+    rooms = ["localization"]
     homes: dict[str, tuple[str, str]] = {}
     for entry in ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body:
         if isinstance(entry, ast.ImportFrom) and entry.module:
             homes |= {name.asname or name.name: (entry.module, name.name) for name in entry.names}
+            rooms += [name.name for name in entry.names if entry.module == __name__]
         elif isinstance(entry, ast.Assign):
             shown = sorted(ast.literal_eval(entry.value))
-    globals().update(__all__=shown, _HOME=homes)
+    globals().update(__all__=shown, _HOME=homes, _ROOMS=rooms)
 
 
 def __getattr__(name: str) -> Any:
@@ -33,7 +35,7 @@ def __getattr__(name: str) -> Any:
 
     if "_HOME" not in globals():
         _read_names()
-    if name in ("__all__", "_HOME"):
+    if name in ("__all__", "_HOME", "_ROOMS"):
         return globals()[name]
     if name not in globals()["_HOME"]:
         raise AttributeError(f"module 'torchchain' has no attribute '{name}'")
@@ -45,4 +47,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__getattr__("__all__"), "__version__", "energy", "master"]
+    return [*__getattr__("__all__"), *__getattr__("_ROOMS"), "__version__"]

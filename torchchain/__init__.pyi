@@ -1,8 +1,12 @@
-# The public names: __all__ holds the everyday ones, the rest resolve as well (also under tc.energy, tc.master).
+# The public names: __all__ holds the everyday ones. The rest belong to the rooms, as tc.energy.bin_energy, and resolve here too.
+from torchchain import chain as chain
 from torchchain import energy as energy
+from torchchain import ensemble as ensemble
+from torchchain import evolvers as evolvers
 from torchchain import frames as frames
 from torchchain import master as master
 from torchchain import mixing as mixing
+from torchchain import modes as modes
 from torchchain import network as network
 from torchchain import species as species
 from torchchain import theory as theory
@@ -103,47 +107,28 @@ from torchchain.results import RunFolder as RunFolder
 from torchchain.results import open_folder as open
 
 __all__ = [
-    "METHODS",
-    "MODELS",
-    "OBSERVABLES",
-    "SOLVERS",
     "BandTransfer",
     "Chain",
-    "DecompositionError",
     "Disorder",
     "FieldError",
-    "FieldTypeError",
-    "FitWarning",
     "Frames",
     "Impulse",
-    "LinearityWarning",
     "MasterEquation",
-    "MasterFamily",
-    "Method",
     "Network",
-    "NormalModes",
-    "Observable",
     "Plan",
-    "ReducedModel",
-    "RunFolder",
-    "Scaling",
     "Scene",
-    "SpectrumWarning",
     "StandingWave",
     "State",
     "Trajectory",
-    "TrustWarning",
     "band_energy",
     "band_transfer",
     "calibrate",
-    "calibrate_family",
     "energy_center",
     "energy_width",
     "estimate_disorder",
     "evolve",
     "impulse",
     "lattice",
-    "localization",
     "long_time_band_energy",
     "normal_modes",
     "open",
@@ -157,6 +142,4 @@ __all__ = [
     "register_observable",
     "simulate",
     "standing_wave",
-    "statistical_distance",
-    "total_variation",
 ]

@@ -8,7 +8,8 @@ LATTICES = ("chain", "square", "triangular", "cubic", "fcc")
 CONTACTS = ("linear", "hertz", "auto")
 DEFINITIONS = ("site", "bond")
 OBSERVABLES = (
-    "band_energy", "center", "displacement", "dissipated", "energy", "front", "long_time_band_energy", "openings",
+    "band_energy", "center", "displacement", "dissipated", "energy", "front", "kicked_band_energy",
+    "long_time_band_energy", "openings",
     "radial_profile", "radius", "source_energy", "spread", "total_energy", "wavenumber_energy", "width",
 )  # fmt: skip
 METHODS = (

@@ -1,8 +1,17 @@
 """Ensembles: a scene, what is measured, how it is run, and what comes out with error bars."""
 
-from torchchain.ensemble.observables import Observable, register_observable
+from torchchain.ensemble.checkpoint import Checkpoint, CheckpointWarning
+from torchchain.ensemble.estimate import estimate_disorder
+from torchchain.ensemble.fused import energy_moments
+from torchchain.ensemble.observables import OBSERVABLES, Observable, register_observable
+from torchchain.ensemble.plan import Plan
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.simulation import simulate
+from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer, Provenance, band_transfer
 
-__all__ = ["BandTransfer", "Observable", "Provenance", "Scene", "band_transfer", "register_observable", "simulate"]
+__all__ = [
+    "OBSERVABLES", "BandTransfer", "Checkpoint", "CheckpointWarning", "Observable", "Plan", "Provenance", "Scene",
+    "band_transfer", "energy_moments", "estimate_disorder", "register_observable", "simulate", "statistical_distance",
+    "total_variation",
+]  # fmt: skip
