@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
 import torchchain as tc
 from torchchain.checks import FieldError
+from torchchain.master import loss
 from torchchain.master.certificate import certify
 from torchchain.master.proof import Certificate
 
@@ -228,12 +230,70 @@ def test_compact_solves_as_a_linear_equation_nearly(compact):
 
 
 def test_compact_refuses_chains_it_is_not_made_for():
-    for change, message in (
-        ({"boundary": "fixed"}, "boundary must be periodic for model 'compact', got fixed"),
-        ({"damping": 0.1}, "damping must be 0.0 for model 'compact'"),
-    ):
-        scene = tc.Scene(n_particles=32, n_bands=4, **change)
-        with pytest.raises(FieldError, match=message):
-            tc.master.calibration.recipe(scene, model="compact")
+    scene = tc.Scene(n_bands=4, lattice="square", shape=(6, 6))
+    with pytest.raises(FieldError, match="lattice must be none for model 'compact', got square"):
+        tc.master.calibration.recipe(scene, model="compact")
     with pytest.raises(FieldError, match="degrees must be at least 1"):
         tc.master.calibration.recipe(tc.Scene(), degrees=(0, 1, 2))
+
+
+# Other chains: beside walls, damped
+
+
+@pytest.mark.parametrize("settings", [{"boundary": "fixed"}, {"damping": 0.01}, {"damping": 0.1, "boundary": "fixed"}])
+def test_walls_and_damping_keep_the_default_never_negative(settings):
+    times = np.arange(0, 60, 0.5)
+    scenes = [
+        tc.Scene(n_particles=64, n_bands=8, realizations=100, times=times, seed=seed, **settings) for seed in (0, 1)
+    ]
+    own, fresh = (tc.band_transfer(scene, long_time="damping" not in settings) for scene in scenes)
+    master = tc.calibrate(own, bootstrap=8)
+    assert master.calibration.report.certificate.holds
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "prediction to time")
+        late = master.transfer(LATE)
+        assert float(late.min()) >= 0
+        assert float(late.sum(-1).max()) <= 1 + 1e-12
+        if "damping" in settings:
+            assert bool((late.sum(-1).diff(dim=1) <= 1e-14).all())
+        off = tc.total_variation(master.transfer(times), fresh.mean)[:, 1:].mean()
+        error = master.standard_error(torch.eye(8, dtype=torch.float64), times).square() + fresh.stderr.square()
+        inside = (master.transfer(times) - fresh.mean).square() < error
+    assert float(off) < 1.35 * float(tc.statistical_distance(fresh.stderr)[:, 1:].mean())
+    assert 0.55 < float(inside[:, 1:].double().mean()) < 0.85
+
+
+def test_what_is_left_of_damped_modes():
+    """Against the equation of motion, below, at and above critical damping; a known mixture comes back."""
+    times = np.linspace(0, 20, 41)
+    for damping, w in ((0.1, 0.7), (2.0, 1.0), (1.5, 2.0)):
+        generator = np.array([[0.0, w], [-w, -damping * w**2]])
+        exact = [float(((scipy.linalg.expm(generator * t) @ [1.0, 0.0]) ** 2).sum()) for t in times]
+        found = loss.mode_energy(np.array([w]), damping, times)[:, 0]
+        np.testing.assert_allclose(found, exact, atol=1e-6)
+    weights = np.zeros((1, loss.MODES))
+    weights[0, [5, 20]] = 0.3, 0.7
+    left = weights @ loss.mode_energy(loss.frequencies(), 0.1, times).T
+    found = loss.mixture(left, 0.1, times)
+    np.testing.assert_allclose(found @ loss.mode_energy(loss.frequencies(), 0.1, times).T, left, atol=1e-6)
+
+
+def test_a_family_of_damped_chains(tmp_path):
+    times = np.arange(0, 40, 0.5)
+    scenes = [
+        tc.Scene(
+            n_particles=32, n_bands=4, realizations=40, times=times, damping=0.05, disorder=tc.Disorder(strength=xi)
+        )
+        for xi in (0.1, 0.2, 0.3)
+    ]
+    transfers = [tc.band_transfer(scene) for scene in scenes]
+    family = tc.calibrate_family([transfers[0], transfers[2]], degrees=(4, 3, 6), bootstrap=4)
+    family.save(tmp_path / "family.safetensors")
+    member = tc.MasterFamily.load(tmp_path / "family.safetensors").at(0.2)
+    found = member.transfer(times)
+    assert float(found.min()) >= 0
+    off = tc.total_variation(found, transfers[1].mean)[:, 1:].mean()
+    assert float(off) < 2 * float(tc.statistical_distance(transfers[1].stderr)[:, 1:].mean())
+    again = member.coarsened(2).transfer(times)
+    assert float((again.sum(-1) - found.unflatten(0, (2, 2)).mean(1).sum(-1)).abs().max()) < 0.02

@@ -592,4 +592,10 @@ def test_as_a_module(tmp_path):
     assert os.listdir(tmp_path) == []
     good = program("simulate", *SMALL, "--out", "out")
     assert (good.returncode, good.stderr) == (0, "")
-    assert sorted(os.listdir(tmp_path / "out")) == ["config.toml", "figure.png", "report.html", "results.nc", "run.json"]
+    assert sorted(os.listdir(tmp_path / "out")) == [
+        "config.toml",
+        "figure.png",
+        "report.html",
+        "results.nc",
+        "run.json",
+    ]

@@ -11,7 +11,7 @@ from torchchain.checks import FieldError, FieldTypeError
 from torchchain.master import logistic, waves
 from torchchain.master.certificate import certify
 from torchchain.master.compact import CompactModel, n_coefficients
-from torchchain.master.compact_family import fit_compact_family
+from torchchain.master.compact_family import calibrate_together
 from torchchain.master.logistic import Regression, chosen_times, fit_compact, regression
 from torchchain.master.misfit import model_error
 from torchchain.master.waves import Waves, first_odds
@@ -174,12 +174,17 @@ def test_a_step_of_gauss_and_newton_is_a_fit_to_other_data(transfers):
     moved = problem.data.copy()
     picked = chosen_times(own.times)
     moved[:, : len(picked)] += 0.05 * (own.block_mean[0][:, picked].numpy() - problem.data[:, : len(picked)])
-    same, changed = logistic.refitted(problem, model, [problem.data, moved])
+    same, changed = logistic.stepped(
+        [problem], np.ones((1, 1)), model.coefficients.numpy()[None], [np.stack([problem.data, moved])]
+    )[:, 0]
     again = Regression(problem.odds, problem.shape, problem.clock, problem.held, moved, problem.weight)
     found, _ = logistic.solve([again], np.ones((1, 1)), model.coefficients.numpy()[None])
     times = own.times
     exact = CompactModel(**{**model.tensors(), "coefficients": torch.from_numpy(found[0])}).transfer(times)
     step = (exact - model.transfer(times)).abs().max()
+    same, changed = (
+        CompactModel(**{**model.tensors(), "coefficients": torch.from_numpy(row)}) for row in (same, changed)
+    )
     assert float((same.transfer(times) - model.transfer(times)).abs().max()) < 0.5 * float(step)
     assert float((changed.transfer(times) - exact).abs().max()) < 0.5 * float(step)
 
@@ -218,19 +223,16 @@ def test_nearest_model_with_memory(transfers):
 def test_family_predicts_a_strength_between():
     own = [tc.band_transfer(scene(strength, realizations=60)) for strength in (0.2, 0.25, 0.35, 0.4)]
     unseen = tc.band_transfer(scene(0.3, seed=1, realizations=60))
-    arguments = ([t.scene for t in own], [t.times for t in own], [t.mean for t in own], [t.long_time for t in own], [distance(t) for t in own])  # fmt: skip
-    family, _ = fit_compact_family(*arguments, ZERO, (6, 4, 8), 3)
+    family = tc.MasterFamily(calibrate_together(own, (0.5, 2.0), 0, (6, 4, 8), 3))
     assert family.n_parameters == 3 * n_coefficients((6, 4, 8))
-    model = family.at(0.3)
+    model = family.at(0.3).model
     assert certify(model).holds
     off = tc.total_variation(model.transfer(unseen.times), unseen.mean).mean()
     assert float(off) < 1.5 * float(distance(unseen).mean())
-    weak = family.at(1e-3).transfer(unseen.times)
+    weak = family.at(1e-3).model.transfer(unseen.times)
     assert float((1 - weak.diagonal(dim1=0, dim2=2)).max()) < 1e-3  # hardly anything moves
     with pytest.raises(FieldError, match="strength must be at most 0.4"):
         family.at(0.5)
-    with pytest.raises(FieldError, match="scenes must have different strengths"):
-        fit_compact_family(*(2 * part[:1] for part in arguments), ZERO, DEGREES, 1)
 
 
 # The model's own error

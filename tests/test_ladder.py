@@ -449,7 +449,7 @@ def test_markov_tests_refuse(call, message):
 
 
 @pytest.fixture(scope="module")
-def family():
+def strengths():
     transfers = []
     for strength in (0.1, 0.2, 0.3, 0.4):
         scene = tc.Scene(
@@ -460,31 +460,53 @@ def family():
             disorder=tc.Disorder(strength=strength),
         )
         transfers.append(tc.band_transfer(scene))
-    return calibrate_family(transfers, order=(1, 1))
+    return transfers
 
 
-def test_weights_of_a_family(family):
-    assert family.strengths == (0.1, 0.2, 0.3, 0.4)
-    for strength in np.linspace(0, 0.4, 41):
-        assert sum(family.weights(strength).values()) == pytest.approx(1, abs=1e-12)
-    assert family.weights(0.3) == {0.3: 1.0}
-    assert family.weights(0.05) == pytest.approx({0.0: 0.75, 0.1: 0.25})
+@pytest.fixture(scope="module")
+def family(strengths):
+    return calibrate_family(strengths, degrees=(4, 3, 6))
+
+
+@pytest.fixture(scope="module")
+def with_memory(strengths):
+    return calibrate_family(strengths, order=(1, 1))
+
+
+def test_weights_of_a_family(family, with_memory):
+    for each in (family, with_memory):
+        assert each.strengths == (0.1, 0.2, 0.3, 0.4)
+        for strength in np.linspace(0, 0.4, 41):
+            assert sum(each.weights(strength).values()) == pytest.approx(1, abs=1e-12)
+        assert each.weights(0.3) == {0.3: 1.0}
+    assert with_memory.weights(0.05) == pytest.approx({0.0: 0.75, 0.1: 0.25})
+    assert family.weights(0.05) == pytest.approx({0.1: 1.0, 0.2: 0.0, 0.3: 0.0, 0.4: 0.0}, abs=1e-12)
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.01, 0.05, 0.1, 0.17, 0.25, 0.39, 0.4])
-def test_a_family_conserves_energy_at_any_strength(family, strength):
+def test_a_family_conserves_energy_at_any_strength(family, with_memory, strength):
     times = torch.linspace(0, 30, 16, dtype=torch.float64)
-    transfer = family.at(strength).model.transfer(times)
-    assert float((transfer.sum(-1) - 1).abs().max()) < 1e-12
-    assert torch.allclose(transfer[:, 0], torch.eye(4, dtype=torch.float64), atol=1e-12)
-    assert family.at(strength).calibration.scene.disorder.strength == strength
+    for each in (family, with_memory):
+        transfer = each.at(strength).model.transfer(times)
+        assert float((transfer.sum(-1) - 1).abs().max()) < 1e-12
+        assert torch.allclose(transfer[:, 0], torch.eye(4, dtype=torch.float64), atol=1e-12)
+        assert each.at(strength).calibration.scene.disorder.strength == strength
 
 
-def test_transfer_vanishes_with_the_square_of_the_strength(family):
-    times = [10.0]
-    moved = [1 - family.solve(EYE, times, xi).diagonal(dim1=0, dim2=2) for xi in (0.02, 0.04)]
-    np.testing.assert_allclose((moved[1] / moved[0]).numpy(), 4, rtol=1e-9)
-    assert torch.allclose(family.solve(EYE, times, 0.0)[:, 0], EYE, atol=1e-12)
+@pytest.mark.parametrize("strength", [0.0, 0.01, 0.17, 0.4])
+def test_a_family_is_never_negative_and_says_so(family, strength):
+    late = torch.cat([torch.zeros(1), torch.logspace(-4, 6, 200)]).double()
+    member = family.at(strength)
+    assert member.calibration.report.certificate.holds
+    assert float(member.model.transfer(late).min()) >= 0
+
+
+def test_transfer_vanishes_with_the_square_of_the_strength(family, with_memory):
+    # the odds of a compact model also depend on distance in units of the decay, which changes with the strength
+    for each, times, error in ((with_memory, [10.0], 1e-9), (family, [1.0, 3.0], 0.05)):
+        moved = [1 - each.solve(EYE, times, xi).diagonal(dim1=0, dim2=2) for xi in (0.02, 0.04)]
+        np.testing.assert_allclose((moved[1] / moved[0]).numpy(), 4, rtol=error)
+        assert torch.allclose(each.solve(EYE, times, 0.0)[:, 0], EYE, atol=1e-12)
 
 
 def test_between_members_prediction_is_near_the_chains(family):
@@ -504,6 +526,20 @@ def test_between_members_prediction_is_near_the_chains(family):
     assert (left, right) == (0.2, 0.3)
 
 
+def test_models_calibrated_alone_are_fitted_together(strengths):
+    alone = [
+        tc.calibrate(transfer, model="compact", degrees=degrees, bootstrap=4)
+        for transfer, degrees in zip(strengths, [(4, 3, 6), (6, 4, 8)] * 2, strict=True)
+    ]
+    family = MasterFamily([*alone[:3], tc.calibrate(strengths[3], "projection", bootstrap=4)])
+    assert {member.model.degrees_ for member in family.members} == {(6, 4, 8)}
+    times = strengths[0].times
+    for member, before in zip(family.members, alone, strict=True):
+        apart = tc.total_variation(member.model.transfer(times), before.model.transfer(times)).mean()
+        assert float(apart) < float(tc.statistical_distance(strengths[0].stderr).mean())
+    assert family.at(0.25).uncertainty is not None
+
+
 def test_a_family_is_one_file(family, tmp_path):
     first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
     family.save(first)
@@ -513,7 +549,7 @@ def test_a_family_is_one_file(family, tmp_path):
         tc.MasterEquation.load(first)
     single = tmp_path / "one.safetensors"
     family.at(0.25).save(single)
-    assert torch.equal(tc.MasterEquation.load(single).model.amplitudes, family.at(0.25).model.amplitudes)
+    assert torch.equal(tc.MasterEquation.load(single).model.coefficients, family.at(0.25).model.coefficients)
     with pytest.raises(FieldError, match="must carry the format torchchain-master-family"):
         MasterFamily.load(single)
     first.write_bytes(first.read_bytes()[:-9])
@@ -529,7 +565,7 @@ def test_families_refuse(family):
     with pytest.raises(FieldError, match="members must be at least one"):
         MasterFamily([])
     plain = tc.MasterEquation(tc.RateModel(EYE * 0, EYE), family.members[0].calibration)
-    with pytest.raises(FieldError, match="members must have the model 'memory'"):
+    with pytest.raises(FieldError, match="members must have the model 'compact' or 'memory'"):
         MasterFamily([plain])
 
 
@@ -544,7 +580,9 @@ def test_families_from_the_command_line(family, tmp_path, capsys):
     assert main(["family", *files, "--out", str(out)]) == 0
     assert "calibrated at 0.1, 0.2, 0.3, 0.4" in capsys.readouterr().out
     model, predicted = str(out / "model.safetensors"), tmp_path / "predicted"
-    assert main(["predict", model, "--strength", "0.25", "--out", str(predicted)]) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TrustWarning)
+        assert main(["predict", model, "--strength", "0.25", "--out", str(predicted)]) == 0
     with xarray.open_dataset(predicted / "results.nc", engine="h5netcdf") as data:
         expected = family.solve(EYE, np.array(data.time), 0.25)
         assert np.array_equal(data.band_energy.values, expected.numpy())

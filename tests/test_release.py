@@ -50,8 +50,12 @@ def test_pinned_versions_are_not_below_the_lowest():
 
 
 def test_lowest_versions_as_pins():
-    said = subprocess.run([sys.executable, ROOT / ".ci" / "lowest.py"], capture_output=True, text=True, check=True).stdout
-    assert said.split() == [r.replace(">=", "==") for r in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["test"]]
+    said = subprocess.run(
+        [sys.executable, ROOT / ".ci" / "lowest.py"], capture_output=True, text=True, check=True
+    ).stdout
+    assert said.split() == [
+        r.replace(">=", "==") for r in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["test"]
+    ]
 
 
 @pytest.mark.parametrize("name", ["tests", "docs"])

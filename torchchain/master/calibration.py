@@ -144,7 +144,7 @@ def calibrate(
     if model is None and transfer.long_time is None and not transfer.damping and not transfer.is_ordered:
         transfer = _settled(transfer)
     asked = recipe(transfer, method, model, window, **settings)
-    replicates = _replicates(bootstrap, asked.fit, transfer)
+    count = replicates(bootstrap, asked.fit, transfer)
     if transfer.is_ordered:
         return _ordered(transfer, asked)
     report, near, errors = Report(), None, None
@@ -158,12 +158,12 @@ def calibrate(
         if isinstance(fitted, MemoryModel) and isinstance(told, ProjectionReport) and not sample.damped:
             fitted, told, proof = certified(transfer, asked, (fitted, told), report.selection is not None, shown.update)
         report = replace(
-            report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=replicates,
+            report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=count,
             certificate=fitted.certificate if isinstance(fitted, CompactModel) else proof,
         )  # fmt: skip
         _check_growth(fitted, asked)
-        if replicates:
-            errors = draw_again(transfer, asked, free, replicates, shown.update, fitted)
+        if count:
+            errors = draw_again(transfer, asked, free, count, shown.update, fitted)
         starts = fit_starts(transfer) if can_fit(transfer) else None
         if starts is not None and errors is not None:
             starts = with_errors(starts, transfer, errors)
@@ -191,7 +191,8 @@ def _record(transfer: BandTransfer, asked: Recipe, report: Report) -> Calibratio
     return Calibration(method, model, asked.window, transfer.scene, report, words)
 
 
-def _replicates(bootstrap: int | None, fit: Fit | None, transfer: BandTransfer) -> int:
+def replicates(bootstrap: int | None, fit: Fit | None, transfer: BandTransfer) -> int:
+    """Ensembles to be drawn again, from what was asked for."""
     blocks = len(transfer.block_counts)
     if bootstrap is None:
         return REPLICATES if (fit is None or fit.quick) and blocks >= 4 else 0

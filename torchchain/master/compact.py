@@ -13,6 +13,7 @@ that is fitted: a logistic regression, by Levenberg's and Marquardt's method.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.master.certificate import CertificateError, nonnegative
+from torchchain.master.loss import frequencies, mode_energy
 from torchchain.master.memory import ORDERS, MemoryModel, checked_order, fit_memory
 from torchchain.master.model import Embedding, TransferModel
 from torchchain.master.proof import Certificate
@@ -69,25 +71,32 @@ def n_coefficients(degrees: Sequence[int]) -> int:
 class CompactModel(TransferModel):
     """T[s, r](t) = o_sr / (own_s + sum o_sr'): odds of a damped beat times the exponential of polynomials (see the module).
 
-    For every t >= 0 and any coefficients no entry is negative, every row adds up to 1, T(0) = I, and T(t) - I starts as t^4.
+    For every t >= 0 and any coefficients no entry is negative, every row adds up to 1, T(0) = I, and T(t) - I starts as t^4:
+    odds are a positive D times an exponential of a bounded exponent (+-LARGEST_EXPONENT), the own band's are an
+    exponential alone, so that the sum which a row is divided by is positive; and D(0) = 0. Of damped chains these are
+    shares of what is left of the energy, which :mod:`torchchain.master.loss` describes.
 
     Args:
         rates: Q [source, receiver] of the linear procedure at short times, for comparison.
         degrees: of the polynomials in place, distance and time, (3,).
         coefficients: of :func:`terms`, p first, (term,).
         waves: as tensors of :class:`Waves`.
+        loss: of damped chains, weight of modes in what is left of the energy of each source, (band, mode); else (band, 0).
+        contact_damping: of a contact of stiffness 1.
     """
 
     kind: ClassVar[str] = "compact"
     axes: ClassVar[dict[str, tuple[str, ...]]] = {
         "rates": ("band", "band"), "degrees": ("degree",), "coefficients": ("term",), "source_frequency": ("band",),
         "source_decay": ("band",), "tone_frequency": ("band", "tone"), "tone_decay": ("band", "tone"), "coupling": (),
+        "loss": ("band", "mode"), "contact_damping": (),
     }  # fmt: skip
     rates_meaning: ClassVar[str] = MemoryModel.rates_meaning
 
     def __init__(
         self, rates: Tensor, degrees: Tensor, coefficients: Tensor, source_frequency: Tensor, source_decay: Tensor,
-        tone_frequency: Tensor, tone_decay: Tensor, coupling: Tensor,
+        tone_frequency: Tensor, tone_decay: Tensor, coupling: Tensor, loss: Tensor | None = None,
+        contact_damping: Tensor | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         rates = checks.real_tensor("rates", rates)
@@ -110,6 +119,24 @@ class CompactModel(TransferModel):
             if name != "coefficients":
                 checks.first_bad(name, "be positive", value, ~(value > 0), "band")
             self.register_buffer(name, value.detach().clone())
+        loss = rates.new_zeros(len(rates), 0) if loss is None else checks.real_tensor("loss", loss).to(rates)
+        if loss.ndim != 2 or len(loss) != len(rates):
+            raise checks.fail("loss", f"have shape ({len(rates)}, modes)", f"shape {tuple(loss.shape)}")
+        if loss.numel():
+            checks.first_bad("loss", "not be negative", loss, loss < 0, "mode")
+            total = loss.sum(-1)
+            checks.first_bad("loss", "add up to 1", total, (total - 1).abs() > 1e-6, "band")
+        contact_damping = checks.real_tensor(
+            "contact_damping", rates.new_zeros(()) if contact_damping is None else contact_damping
+        ).to(rates)
+        if contact_damping.ndim or bool(contact_damping < 0) or bool(contact_damping > 0) != bool(loss.numel()):
+            raise checks.fail(
+                "contact_damping", "be a number, above 0 with a loss and 0 without", contact_damping.tolist()
+            )
+        self.register_buffer("loss", loss.detach().clone())
+        self.register_buffer("contact_damping", contact_damping.detach().clone())
+        self.loss: Tensor
+        self.contact_damping: Tensor
         self.source_frequency: Tensor
         self.source_decay: Tensor
         self.tone_frequency: Tensor
@@ -131,11 +158,13 @@ class CompactModel(TransferModel):
     @property
     def basis(self) -> Tensor:  # type: ignore[override]
         """Pi [source, receiver], T at infinite time."""
+        if self.loss.numel():
+            return torch.zeros_like(self._rates)
         return self._at(self._rates.new_full((1,), math.inf))[:, 0]
 
     @property
     def damping(self) -> Tensor:  # type: ignore[override]
-        """None, [band]."""
+        """None on top of the model's own, [band]."""
         return torch.zeros_like(self._rates[0])
 
     @property
@@ -148,7 +177,7 @@ class CompactModel(TransferModel):
 
     @property
     def n_parameters(self) -> int:
-        return len(self.coefficients)
+        return len(self.coefficients) + int((self.loss > 0).sum())
 
     @property
     def conservation_defect(self) -> float:
@@ -158,12 +187,19 @@ class CompactModel(TransferModel):
     @property
     def certificate(self) -> Certificate:
         """By construction, for every t >= 0."""
-        eps = torch.finfo(self._rates.dtype).eps
-        return Certificate(0.0, 1.0 + 2 * self.n_bands * eps, 2 * self.n_bands * eps, 0.0, 0)
+        slack = 2 * self.n_bands * torch.finfo(self._rates.dtype).eps
+        return Certificate(0.0, 1.0 + slack, math.inf if self.loss.numel() else slack, 0.0, 0)
 
     def tensors(self) -> dict[str, Tensor]:
         degrees = self._rates.new_tensor(self.degrees_)
-        return {"rates": self.rates, "degrees": degrees, "coefficients": self.coefficients, **self.waves.tensors()}
+        return {
+            "rates": self.rates,
+            "degrees": degrees,
+            "coefficients": self.coefficients,
+            "loss": self.loss,
+            "contact_damping": self.contact_damping,
+            **self.waves.tensors(),
+        }
 
     def _apply(self, fn: Any, recurse: bool = True) -> CompactModel:
         super()._apply(fn, recurse)
@@ -171,7 +207,7 @@ class CompactModel(TransferModel):
         return self
 
     def _at(self, times: Tensor, sources: Tensor | None = None) -> Tensor:
-        """T at times that may be infinite, (source, time, receiver), of all sources or some, by number."""
+        """T of undamped chains at times that may be infinite, (source, time, receiver), of all sources or some, by number."""
         sources = torch.arange(self.n_bands, device=times.device) if sources is None else sources
         odds = first_odds(self.waves, times, sources)
         clock = polynomials(clock_of(times), self.degrees_[2])
@@ -182,14 +218,24 @@ class CompactModel(TransferModel):
         moved = moved * (1 - mask) + own[:, :, None] * mask
         return moved / moved.sum(-1, keepdim=True)
 
+    def _moved(self, times: Tensor, sources: Tensor | None = None) -> Tensor:
+        """T, (source, time, receiver), of all sources or some."""
+        found = self._at(times, sources)
+        if not self.loss.numel():
+            return found
+        modes = frequencies(self.loss.shape[1])
+        left = mode_energy(modes, float(self.contact_damping), times.double().cpu().numpy())
+        weights = self.loss if sources is None else self.loss[sources]
+        return found * (weights @ torch.from_numpy(left).to(weights).T)[..., None]
+
     def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
         if initial.requires_grad:
-            return torch.einsum("...s,str->...tr", initial, self._at(times))
+            return torch.einsum("...s,str->...tr", initial, self._moved(times))
         used = (initial.reshape(-1, self.n_bands) != 0).any(0).nonzero()[:, 0]  # other sources have nothing to give
-        return torch.einsum("...s,str->...tr", initial[..., used], self._at(times, used))
+        return torch.einsum("...s,str->...tr", initial[..., used], self._moved(times, used))
 
     def as_memory(self, order: tuple[int, int] = (4, 6), span: float = 1e3) -> MemoryModel:
-        """The nearest model with memory, certified: exponentials for whoever needs a linear differential equation.
+        """The nearest model with memory, certified if undamped: exponentials for whoever needs a linear differential equation.
 
         Args:
             order: numbers of exponentials and of pairs, or the next smaller ones with which a model is never negative.
@@ -201,14 +247,16 @@ class CompactModel(TransferModel):
         times = torch.cat([
             torch.linspace(0.25, 5, 20, dtype=torch.float64), torch.logspace(math.log10(5.3), math.log10(span), 90, dtype=torch.float64),
         ])  # fmt: skip
+        own = self if self._rates.dtype == torch.float64 else copy.deepcopy(self).double()
         with torch.no_grad():
-            mean = self.double()._at(times) if self._rates.dtype != torch.float64 else self._at(times)
-            basis = self.basis
+            mean, basis = own._moved(times), own.basis
         order = checked_order(order, len(times))
         for smaller in (order, *(known for known in ORDERS[::-1] if sum(known) < sum(order))):
-            tensors, _ = fit_memory(times, mean, basis, smaller)
+            model = MemoryModel(rates=own.rates, **fit_memory(times, mean, basis, smaller)[0])
+            if self.loss.numel():  # what decays to nothing has no long-time energy to stay above of
+                return model
             try:
-                return nonnegative(MemoryModel(rates=self.rates, **tensors), times, mean)[0]
+                return nonnegative(model, times, mean)[0]
             except CertificateError as error:
                 reason = error
         raise reason

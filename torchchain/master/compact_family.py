@@ -1,102 +1,236 @@
-"""Compact models of a range of disorder, fitted at once."""
+"""Compact models of several strengths of disorder, fitted together: their coefficients are polynomials of sqrt(xi).
+
+The waves of a strength are known, and D is proportional to xi^2: what the coefficients have to tell changes slowly with xi.
+Any coefficients make a model that is never negative and conserves energy, so every strength in between has one.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchchain import checks
 from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.statistics import statistical_distance
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.compact import CompactModel, checked_degrees
-from torchchain.master.logistic import regression, solve
+from torchchain.master.compact_record import (
+    CompactReport,
+    check_scene,
+    drawn_again,
+    loss_tensors,
+    redrawn,
+    regression_of,
+    shares_of,
+)
+from torchchain.master.equation import MasterEquation
+from torchchain.master.fits import linear_weights
+from torchchain.master.logistic import solve, stepped
+from torchchain.master.misfit import model_error
+from torchchain.master.report import Calibration, Report
+from torchchain.master.sample import Sample
+from torchchain.master.uncertainty import Uncertainty, block_draws, combined, horizon
 from torchchain.master.waves import Waves
 
+DEGREES = (9, 6, 13)
+SETS = 5
+"""Polynomials of sqrt(xi), at most: 1,490 fitted numbers with these degrees."""
+WEAKEST = 1e-9
+"""In place of no disorder, where nothing moves."""
 
-@dataclass(frozen=True, eq=False)
-class CompactFamily:
-    """Compact models for a range of strengths xi: the coefficients are polynomials of sqrt(xi), the waves those of xi itself.
 
-    Any coefficients make a model that is never negative and conserves energy, so every strength in between has one.
+def polynomials_of(strengths: Sequence[float], known: Sequence[float], sets: int) -> np.ndarray:
+    """Chebyshev's polynomials in sqrt(xi) from the lowest to the highest known strength, (strength, set)."""
+    low, high = math.sqrt(known[0]), math.sqrt(known[-1])
+    x = (2 * np.sqrt(np.asarray(strengths)) - low - high) / max(high - low, 1e-12)
+    return np.polynomial.chebyshev.chebvander(np.clip(x, -1, 1), sets - 1)
 
-    Attributes:
-        scene: of the ensembles, but for the strength of the disorder.
-        lowest, highest: strengths of the ensembles that the family was fitted to.
-        degrees: of the polynomials in place, distance and time.
-        coefficients: (set, term), of Chebyshev's polynomials in sqrt(xi) from the zeroth.
-        rates: Q of the linear procedure, for comparison, [source, receiver].
+
+def weights(strength: float, known: Sequence[float], sets: int) -> np.ndarray:
+    """Weight of the coefficients of each known strength at another, (strength,); they add up to 1.
+
+    Below the lowest, the lowest's own hold.
     """
-
-    scene: Scene
-    lowest: float
-    highest: float
-    degrees: tuple[int, int, int]
-    coefficients: Tensor
-    rates: Tensor
-
-    @property
-    def n_parameters(self) -> int:
-        return self.coefficients.numel()
-
-    def at(self, strength: float) -> CompactModel:
-        """The model at a strength above 0: below the lowest with the lowest's coefficients, for D is proportional to xi^2.
-
-        Raises:
-            FieldError: above the highest.
-        """
-        strength = checks.number("strength", strength, above=0, at_most=self.highest * (1 + 1e-12))
-        sets = torch.from_numpy(_sets(max(strength, self.lowest), self.lowest, self.highest, len(self.coefficients)))
-        return CompactModel(
-            rates=self.rates, degrees=torch.tensor(self.degrees, dtype=torch.float64),
-            coefficients=sets.to(self.coefficients) @ self.coefficients,
-            **_of_strength(self.scene, strength).tensors(),
-        )  # fmt: skip
+    return polynomials_of([strength], known, sets)[0] @ np.linalg.pinv(polynomials_of(known, known, sets))
 
 
-def _sets(strength: float, lowest: float, highest: float, count: int) -> np.ndarray:
-    """Chebyshev's polynomials in sqrt(xi), (set,)."""
-    span = max(math.sqrt(highest) - math.sqrt(lowest), 1e-12)
-    x = 2 * (math.sqrt(strength) - math.sqrt(lowest)) / span - 1
-    return np.cos(np.arange(count) * math.acos(min(1.0, max(-1.0, x))))
+def between(members: Sequence[MasterEquation], scene: Scene, sets: int) -> CompactModel:
+    """The model of a scene whose strength may lie between those of members that were fitted together.
 
+    What damped chains have left is a mixture of that of the nearest two.
+    """
+    known = [member.calibration.strength or WEAKEST for member in members]
+    strength = max(scene.disorder.strength, WEAKEST)
+    tensors = [member.model.tensors() for member in members]
 
-def _of_strength(scene: Scene, strength: float) -> Waves:
-    """Waves of a scene with another strength of its masses' disorder."""
+    def summed(name: str, shares: Sequence[float]) -> Tensor:
+        return torch.stack([share * each[name].double() for share, each in zip(shares, tensors, strict=True)]).sum(0)
+
+    near = nearest(strength, known)
     other = scene.stiffness_disorder
-    return Waves.of(scene, math.hypot(strength, 0.0 if other is None else other.strength))
+    waves = Waves.of(scene, math.hypot(strength, 0.0 if other is None else other.strength))
+    mixed = {"coefficients": summed("coefficients", weights(strength, known, sets).tolist())}
+    mixed |= {name: summed(name, near) for name in ("rates", "loss")}
+    return CompactModel(**tensors[0] | mixed | waves.tensors())
 
 
-def fit_compact_family(
-    scenes: Sequence[Scene], times: Sequence[Tensor], means: Sequence[Tensor], long_times: Sequence[Tensor | None],
-    distances: Sequence[Tensor | None], rates: Tensor, degrees: tuple[int, int, int] = (9, 6, 13), sets: int = 5,
+def nearest(strength: float, known: Sequence[float]) -> list[float]:
+    """Weight of each known strength: linear in log xi between the nearest two, the lowest's alone below it."""
+    place = float(np.interp(math.log(max(strength, WEAKEST)), np.log(known), np.arange(len(known))))
+    return [max(0.0, 1 - abs(place - i)) for i in range(len(known))]
+
+
+def fit_together(
+    samples: Sequence[Sample], degrees: tuple[int, int, int] = DEGREES, sets: int = SETS,
     progress: Callable[[int], Any] | None = None,
-) -> tuple[CompactFamily, dict[str, Any]]:  # fmt: skip
-    """One family from ensembles that differ in the strength of their masses' disorder, all fitted at once.
+) -> tuple[np.ndarray, CompactReport]:  # fmt: skip
+    """Coefficients for every sample, (sample, coefficient), and how the regression went.
 
     Args:
-        scenes, times, means, long_times, distances: of each ensemble, see :func:`regression`.
-        rates: kept for comparison.
-        sets: coefficients of the polynomial in the strength, fewer than there are ensembles, or as many.
-
-    Raises:
-        FieldError: for too few ensembles, or if two have the same strength.
+        samples: of chains that differ in the strength of their masses' disorder, in order of it.
+        degrees: of the polynomials in place, distance and time.
+        sets: polynomials of sqrt(xi), no more than there are samples.
+        progress: called with 1 after every step.
     """
-    degrees = checked_degrees(degrees)
-    strengths = [scene.disorder.strength for scene in scenes]
-    if len(set(strengths)) < len(strengths) or not strengths or min(strengths) <= 0:
-        raise checks.fail("scenes", "have different strengths of disorder above 0", strengths)
-    sets = checks.integer("sets", sets, 1, len(scenes))
-    lowest, highest = min(strengths), max(strengths)
-    problems = [
-        regression(_of_strength(scene, scene.disorder.strength), degrees, t, mean, late, distance)
-        for scene, t, mean, late, distance in zip(scenes, times, means, long_times, distances, strict=True)
+    problems = [regression_of(sample, degrees) for sample in samples]
+    mixing = _mixing(samples, sets)
+    found, told = solve(problems, mixing, progress=progress)
+    return mixing @ found, CompactReport(told["converged"], told["steps"], told["misfit"], degrees, mixing.shape[1])
+
+
+def _mixing(samples: Sequence[Sample], sets: int) -> np.ndarray:
+    strengths = [sample.strength or WEAKEST for sample in samples]
+    return polynomials_of(strengths, strengths, min(sets, len(strengths)))
+
+
+def calibrate_together(
+    transfers: Sequence[BandTransfer], window: tuple[float, float], replicates: int,
+    degrees: tuple[int, int, int] | None = None, sets: int = SETS, progress: Callable[[int], Any] | None = None,
+) -> list[MasterEquation]:  # fmt: skip
+    """Compact models of ensembles of several strengths, in order of them, with error bars by bootstrap of all at once.
+
+    Args:
+        transfers: of ensembles that differ in the strength of their masses' disorder.
+        window: of the slopes that are kept for comparison.
+        replicates: ensembles drawn again, 0 for no error bars.
+        degrees, sets, progress: see :func:`fit_together`.
+    """
+    for transfer in transfers:
+        check_scene(transfer.scene)
+    transfers = sorted(transfers, key=lambda transfer: Sample.of(transfer).strength or 0.0)
+    degrees = DEGREES if degrees is None else checked_degrees(degrees)
+    samples = [Sample.of(transfer) for transfer in transfers]
+    found, told = fit_together(samples, degrees, sets, progress)
+    slopes = [torch.einsum("t,str->sr", linear_weights(s.times, window), s.distribution().mean) for s in samples]
+    models = [
+        _model(sample, rates, degrees, row) for sample, rates, row in zip(samples, slopes, found, strict=True)
+    ]  # fmt: skip
+    errors: list[Uncertainty] | list[None] = [None] * len(models)
+    if replicates:
+        errors = _errors(transfers, samples, models, window, replicates, told.sets)
+    return [
+        MasterEquation(
+            model,
+            Calibration("logistic", "compact", window, transfer.scene, Report(
+                fit=told, horizon=horizon(transfer, model), bootstrap=replicates, certificate=model.certificate,
+            )),
+            error,
+        )
+        for transfer, model, error in zip(transfers, models, errors, strict=True)
+    ]  # fmt: skip
+
+
+def _model(sample: Sample, rates: Tensor, degrees: tuple[int, int, int], coefficients: np.ndarray) -> CompactModel:
+    assert sample.scene is not None, "check_scene has seen it"
+    return CompactModel(
+        rates=rates, degrees=torch.tensor(degrees, dtype=torch.float64), coefficients=torch.from_numpy(coefficients.copy()),
+        **Waves.of(sample.scene).tensors(), **loss_tensors(sample),
+    )  # fmt: skip
+
+
+def _errors(
+    transfers: Sequence[BandTransfer], samples: Sequence[Sample], models: Sequence[CompactModel],
+    window: tuple[float, float], replicates: int, sets: int,
+) -> list[Uncertainty]:  # fmt: skip
+    """Error bars of all models: the blocks of every ensemble are drawn again, each time by one step from the solution."""
+    repeats = [block_draws(len(transfer.block_counts), replicates, i) for i, transfer in enumerate(transfers)]
+    mixing = _mixing(samples, sets)
+    problems = [regression_of(sample, models[0].degrees_) for sample in samples]
+    found = np.linalg.pinv(mixing) @ np.stack([model.coefficients.numpy() for model in models])
+    drawn = [drawn_again(transfer, repeat) for transfer, repeat in zip(transfers, repeats, strict=True)]
+    others = np.einsum("ms,rsc->mrc", mixing, stepped(problems, mixing, found, [shares_of(each) for each in drawn]))
+    return [
+        combined(transfer, model, redrawn(transfer, model, window, *rest))
+        for transfer, model, *rest in zip(transfers, models, repeats, drawn, others, strict=True)
     ]
-    mixing = np.stack([_sets(strength, lowest, highest, sets) for strength in strengths])
-    found, report = solve(problems, mixing, progress=progress)
-    family = CompactFamily(scenes[0], lowest, highest, degrees, torch.from_numpy(found), rates)
-    return family, report | {"degrees": list(degrees), "strengths": strengths, "sets": sets}
+
+
+def joined(members: Sequence[MasterEquation]) -> list[MasterEquation]:
+    """Models that were calibrated each alone, fitted together to what they predict, weighted by their error bars."""
+    degrees = max((m.model.degrees_ for m in members if isinstance(m.model, CompactModel)), key=sum)
+    samples = [_seen(member) for member in members]
+    found, told = fit_together(samples, min(degrees, DEGREES, key=sum))
+    again = []
+    for member, sample, row in zip(members, samples, found, strict=True):
+        model, errors = _model(sample, member.rates.detach(), told.degrees, row), member.uncertainty
+        if errors is not None:
+            before, now = (each.transfer(errors.times).detach() for each in (member.model, model))
+            off = model_error(now, before, errors.stderr, errors.stderr)
+            errors = replace(errors, stderr=(errors.stderr.square() + off.square()).sqrt())
+        record = member.calibration
+        report = replace(record.report, fit=told, certificate=model.certificate)
+        again.append(MasterEquation(model, replace(record, method="logistic", model="compact", report=report), errors))
+    return again
+
+
+def _seen(member: MasterEquation) -> Sample:
+    """What a model predicts, as a sample of its chains."""
+    scene, errors = member.calibration.scene, member.uncertainty
+    assert scene is not None, "a family's constructor has checked it"
+    times, damped = scene.times if errors is None else errors.times, scene.damping > 0
+    late = None if damped else member.basis.detach()
+    return Sample(
+        times, member.model.transfer(times).detach(), late, scene.disorder.strength, damped, scene,
+        None if errors is None else statistical_distance(errors.stderr).mean(0),
+    )  # fmt: skip
+
+
+def errors_between(
+    members: Sequence[MasterEquation], model: CompactModel, scene: Scene, sets: int
+) -> Uncertainty | None:
+    """Error bars of the model of a scene between those of members: theirs, and by how much interpolation may be off.
+
+    Errors of the odds are interpolated between the nearest two strengths. What interpolation is off by is taken from the
+    distance to a polynomial of sqrt(xi) of one degree less.
+    """
+    held = [(member, member.uncertainty) for member in members if member.uncertainty is not None]
+    if len(held) < len(members):
+        return None
+    known, strength = [member.calibration.strength or WEAKEST for member in members], scene.disorder.strength
+    shares = nearest(strength, known)
+    times = held[shares.index(max(shares))][1].times
+    eye, here = torch.eye(model.n_bands, dtype=torch.float64), model.transfer(times).detach()
+    variance, slopes, bases = torch.zeros_like(here), torch.zeros_like(eye), torch.zeros_like(eye)
+    for weight, (member, errors) in zip(shares, held, strict=True):
+        if weight:
+            scale = _odds_slope(here) / _odds_slope(member.model.transfer(times).detach())
+            variance += weight * (errors.of(eye, times) * scale).square()
+            bases += (
+                weight * (errors.basis_stderr * _odds_slope(model.basis) / _odds_slope(member.basis.detach())).square()
+            )
+            slopes += weight * errors.rates_stderr.square()
+    spread = variance.sqrt()
+    if strength not in known and sets > 1:
+        lower = between(members, scene, sets - 1).transfer(times).detach()
+        spread = (variance + model_error(here, lower, spread, spread).square()).sqrt()
+    return Uncertainty(slopes.sqrt(), bases.sqrt(), times, spread)
+
+
+def _odds_slope(share: Tensor) -> Tensor:
+    """By how much a share of the energy changes with the logarithm of its odds."""
+    return (share * (1 - share)).clamp(min=1e-30)

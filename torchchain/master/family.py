@@ -18,7 +18,11 @@ from torchchain.ensemble.scene import Scene, describe
 from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import file
-from torchchain.master.calibration import calibrate
+from torchchain.master.calibration import calibrate, recipe, replicates
+from torchchain.master.compact import CompactModel
+from torchchain.master.compact_family import WEAKEST, between, calibrate_together, errors_between, joined
+from torchchain.master.compact_family import weights as compact_weights
+from torchchain.master.compact_record import COMPACT, CompactReport
 from torchchain.master.equation import MasterEquation
 from torchchain.master.memory import MemoryModel
 from torchchain.master.report import Loss, Report
@@ -30,14 +34,18 @@ NEIGHBORS = 4
 class MasterFamily(Printed):
     """Master equations of the same bands and chains for several strengths xi of the disorder.
 
-    At a strength between them the transfer is a weighted sum of those of up to four neighbors, with the weights of
-    Lagrange's polynomial in log xi, at every time. They add up to 1, so that energy is conserved as exactly as
-    by the members, and at time 0 every band has its own energy. Below the lowest strength the other neighbor is the chain
-    without disorder, in which nothing moves, with the weight 1 - (xi / lowest)^2: to leading order what weak disorder
-    moves is proportional to xi^2 at every time, and it vanishes with xi.
+    Compact models are fitted together, with coefficients that are polynomials of sqrt(xi): a strength between them has its
+    own, which is never negative and conserves energy. Members that were calibrated alone are first fitted together to
+    what they predict.
+
+    Of models with memory alone (of damped chains, say) the transfer at a strength between is a weighted sum of those of up
+    to four neighbors, with the weights of Lagrange's polynomial in log xi, at every time. They add up to 1, so that
+    energy is conserved as exactly as by the members, and at time 0 every band has its own energy. Below the lowest
+    strength the other neighbor is the chain without disorder, in which nothing moves, with the weight
+    1 - (xi / lowest)^2: to leading order what weak disorder moves is proportional to xi^2 at every time.
 
     Args:
-        members: models with memory, of different strengths.
+        members: compact models or models with memory, of different strengths.
 
     Raises:
         FieldError: if they differ in more than the strength of the disorder.
@@ -65,8 +73,8 @@ class MasterFamily(Printed):
         first = scene_of(self.members[0])
         for member in self.members:
             scene = scene_of(member)
-            if not isinstance(member.model, MemoryModel):
-                raise checks.fail("members", "have the model 'memory'", repr(member.calibration.model))
+            if not isinstance(member.model, (CompactModel, MemoryModel)):
+                raise checks.fail("members", "have the model 'compact' or 'memory'", repr(member.calibration.model))
             for name in ("n_particles", "n_bands", "boundary", "contact", "damping", "stiffness_disorder"):
                 if getattr(scene, name) != getattr(first, name):
                     raise checks.fail(
@@ -77,6 +85,22 @@ class MasterFamily(Printed):
         found = self.strengths
         if any(b <= a for a, b in pairwise(found)) or found[0] == 0:
             raise checks.fail("members", "have different strengths above 0", list(found))
+        if any(isinstance(member.model, CompactModel) for member in self.members) and not self._sets:
+            self.members = tuple(joined(self.members))
+
+    @property
+    def _sets(self) -> int:
+        """Polynomials of sqrt(xi) that the members' coefficients are made of, 0 if they were not fitted together."""
+        reports = [member.calibration.report.fit for member in self.members]
+        if not all(isinstance(report, CompactReport) for report in reports) or len({*reports}) > 1:
+            return 0
+        return int(reports[0].sets)
+
+    @property
+    def n_parameters(self) -> int:
+        """Fitted numbers."""
+        each = sum(member.n_parameters for member in self.members)
+        return each * self._sets // len(self.members) if self._sets else each
 
     @property
     def strengths(self) -> tuple[float, ...]:
@@ -92,6 +116,9 @@ class MasterFamily(Printed):
         strength = min(strength, known[-1])
         if strength in known:
             return {strength: 1.0}
+        if self._sets:
+            shares = compact_weights(max(strength, WEAKEST), known, self._sets)
+            return dict(zip(known, map(float, shares), strict=True))
         if strength < known[0]:
             share = (strength / known[0]) ** 2
             return {0.0: 1 - share, known[0]: share}
@@ -113,6 +140,8 @@ class MasterFamily(Printed):
         chosen = dict(zip(self.strengths, self.members, strict=True))
         if len(weights) == 1:  # a member's own strength
             return chosen[next(iter(weights))]
+        if self._sets:
+            return self._between(float(strength), weights)
         parts = [(w, chosen[xi]) for xi, w in weights.items() if xi in chosen]
         record = parts[0][1].calibration
         scene = scene_of(parts[0][1])
@@ -129,6 +158,19 @@ class MasterFamily(Printed):
             _combined_errors(parts),
         )
 
+    def _between(self, strength: float, weights: dict[float, float]) -> MasterEquation:
+        """At a strength between those of compact models."""
+        record = self.members[0].calibration
+        scene = scene_of(self.members[0])
+        scene = replace(scene, disorder=replace(scene.disorder, strength=strength))
+        model = between(self.members, scene, self._sets)
+        report = Report(
+            fit=record.report.fit, horizon=min(member.horizon for member in self.members),
+            bootstrap=record.report.bootstrap, certificate=model.certificate, interpolated=tuple(weights.items()),
+        )  # fmt: skip
+        errors = errors_between(self.members, model, scene, self._sets)
+        return MasterEquation(model, replace(record, scene=scene, report=report), errors)
+
     def solve(self, initial: Any, times: Any, strength: float, method: str = "expm", **options: Any) -> Tensor:
         """Band energies at a strength; see :meth:`MasterEquation.solve`."""
         return self.at(strength).solve(initial, times, method, **options)
@@ -139,11 +181,12 @@ class MasterFamily(Printed):
         Args:
             times: at which they are compared, (time,); the mean is over these and all sources.
         """
-        times = checks.times("times", times)
+        times = checks.times("times", times).to(self.members[0].rates)
         found = []
         for i in range(1, len(self.members) - 1):
             member = self.members[i]
-            others = MasterFamily([*self.members[:i], *self.members[i + 1 :]])
+            rest = (*self.members[:i], *self.members[i + 1 :])
+            others = MasterFamily(joined(rest) if self._sets else rest)
             strength = self.strengths[i]
             there = others.at(strength).model.transfer(times)
             found.append((strength, float(total_variation(there, member.model.transfer(times)).mean())))
@@ -182,11 +225,12 @@ def scene_of(member: MasterEquation) -> Scene:
 
 
 def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> MasterFamily:
-    """Calibrate a model with memory on each transfer and join them.
+    """Calibrate compact models on all transfers at once, or a model with memory on each, and join them.
 
     Args:
         transfers: of ensembles that differ in the strength of their disorder (and in seeds, realizations and times).
-        settings: of :func:`torchchain.calibrate`, but method and model.
+        settings: ``degrees`` in place, distance and time, ``window`` and ``bootstrap`` as in :func:`torchchain.calibrate`.
+            With ``order``, and for chains that the compact model cannot describe (damped, say), models with memory.
 
     Returns:
         MasterFamily, ``at(strength)`` of which is a MasterEquation.
@@ -202,7 +246,12 @@ def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> Mast
         raise checks.FieldTypeError(f"transfers must be a list of band transfers, got {checks.shown(transfers)}")
     for transfer in transfers:
         checks.instance("transfers", transfer, BandTransfer)
-    return MasterFamily([calibrate(transfer, "projection", "memory", **settings) for transfer in transfers])
+    if "order" in settings or not all(COMPACT.describes(transfer.scene) for transfer in transfers):
+        return MasterFamily([calibrate(transfer, "projection", "memory", **settings) for transfer in transfers])
+    checks.known_keys("settings", settings, ("degrees", "window", "bootstrap"))
+    asked = [recipe(transfer, "logistic", "compact", window=settings.get("window")) for transfer in transfers]
+    counts = [replicates(settings.get("bootstrap"), asked[0].fit, transfer) for transfer in transfers]
+    return MasterFamily(calibrate_together(transfers, asked[0].window, min(counts), settings.get("degrees")))
 
 
 def _combined(parts: Sequence[tuple[float, MasterEquation]], idle: float) -> MemoryModel:

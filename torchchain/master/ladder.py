@@ -15,7 +15,7 @@ compact        odds of damped beats, corrected by polynomials; never negative  5
 from __future__ import annotations
 
 from torchchain import checks
-from torchchain.master.logistic import COMPACT
+from torchchain.master.compact_record import COMPACT
 from torchchain.master.memory import MEMORY
 from torchchain.master.model import TransferModel
 from torchchain.master.rates import BASIS_MATRIX, EXACT_PSI, PAPER, SWING_IN

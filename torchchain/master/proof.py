@@ -43,11 +43,14 @@ class Certificate:
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> Certificate:
         """The inverse of :meth:`to_dict`, checked."""
-        checks.instance("certificate", record, dict)
+        checks.instance("report.certificate", record, dict)
         names = [entry.name for entry in fields(cls)]
-        checks.known_keys("certificate", record, names)
+        checks.known_keys("report.certificate", record, names)
         values: dict[str, Any] = {}
         for name in names:
             value = record.get(name, "nothing")
-            values[name] = math.inf if value == "infinite" else checks.number(f"certificate.{name}", value)
-        return cls(**values | {"intervals": checks.integer("certificate.intervals", record["intervals"], 0)})
+            values[name] = math.inf if value == "infinite" else checks.number(f"report.certificate.{name}", value)
+        return cls(
+            **values
+            | {"intervals": checks.integer("report.certificate.intervals", record.get("intervals", "nothing"), 0)}
+        )

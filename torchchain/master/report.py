@@ -115,17 +115,21 @@ class Report:
             del plain["horizon"]
         if self.certificate is None:
             del plain["certificate"]
+        else:
+            plain["certificate"] = self.certificate.to_dict()
         return plain
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any], fit: type | None) -> Report:
         """The inverse of :meth:`to_dict`, checked; ``fit`` is the record of the method."""
-        rest = {name: value for name, value in plain.items() if name != "fit"}
+        rest = {name: value for name, value in plain.items() if name not in ("fit", "certificate")}
         told = plain.get("fit")
         if told is not None and fit is None:
             raise checks.fail("report.fit", "be of a registered method", told)
         found = None if told is None or fit is None else read("report.fit", fit, told)
-        report = dataclasses.replace(read("report", cls, rest), fit=found)
+        proof = plain.get("certificate")
+        proved = None if proof is None else Certificate.from_dict(proof)
+        report = dataclasses.replace(read("report", cls, rest), fit=found, certificate=proved)
         if not report.horizon >= 0:
             raise checks.fail("report.horizon", "be at least 0", report.horizon)
         return report

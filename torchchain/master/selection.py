@@ -41,7 +41,9 @@ def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
         for settings in record.rungs(len(transfer.times)):
             size = record.size(transfer.n_bands, damped, settings)
             found.append((size, replace(asked, model=record, fit=fit, settings=settings)))
-    return [recipe for _, recipe in sorted(found, key=lambda entry: entry[0])]
+    ordered = [recipe for _, recipe in sorted(found, key=lambda entry: entry[0])]
+    sure = [recipe for recipe in ordered if recipe.model is not None and recipe.model.never_negative]
+    return sure if damped and sure else ordered
 
 
 def select(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,13 +129,27 @@ def draw_again(
         progress: called with 1 after every replicate.
         chosen: the model whose own misfit counts, where that is not ``model`` but one as near to the ensemble.
     """
-    blocks = len(transfer.block_counts)
-    draws = np.random.Generator(np.random.Philox(key=np.array([blocks, replicates], dtype=np.uint64)))
-    drawn = [np.bincount(draws.integers(0, blocks, blocks), minlength=blocks) for _ in range(replicates)]
-    kept = _kept(transfer.times)
+    drawn = block_draws(len(transfer.block_counts), replicates)
+    return combined(transfer, chosen or model, _replicas(transfer, recipe, model, drawn), progress)
+
+
+def block_draws(blocks: int, replicates: int, ensemble: int = 0) -> Tensor:
+    """How often each block is drawn, (replica, block); ``ensemble`` tells several apart whose draws are independent."""
+    key = np.array([blocks + (ensemble << 32), replicates], dtype=np.uint64)
+    draws = np.random.Generator(np.random.Philox(key=key))
+    return torch.from_numpy(
+        np.stack([np.bincount(draws.integers(0, blocks, blocks), minlength=blocks) for _ in range(replicates)])
+    )
+
+
+def combined(
+    transfer: BandTransfer, model: TransferModel, replicas: Iterable[TransferModel], progress: Progress = None
+) -> Uncertainty:
+    """Standard errors from the spread of models of ensembles drawn again, and from what the model itself misses."""
+    kept, blocks = kept_times(transfer.times), len(transfer.block_counts)
     times = transfer.times[kept]
     rates, bases, paths = [], [], []
-    for other in _replicas(transfer, recipe, model, torch.from_numpy(np.stack(drawn))):
+    for other in replicas:
         rates.append(other.rates.detach())
         bases.append(other.basis)
         paths.append(other.transfer(times).detach())
@@ -144,9 +158,7 @@ def draw_again(
     # blocks drawn with replacement spread (blocks - 1) / blocks of what independent ensembles do
     scale = math.sqrt(blocks / (blocks - 1))
     spread = scale * torch.stack(paths).std(0)
-    own = model_error(
-        (chosen or model).transfer(times).detach(), transfer.mean[:, kept], transfer.stderr[:, kept], spread
-    )
+    own = model_error(model.transfer(times).detach(), transfer.mean[:, kept], transfer.stderr[:, kept], spread)
     return Uncertainty(
         scale * torch.stack(rates).std(0), scale * torch.stack(bases).std(0), times,
         (spread.square() + own.square()).sqrt().float(),  # known to a few per cent
@@ -165,7 +177,7 @@ def _replicas(transfer: BandTransfer, recipe: Recipe, model: TransferModel, repe
         yield other
 
 
-def _kept(times: Tensor) -> Tensor:
+def kept_times(times: Tensor) -> Tensor:
     """Indices of at most MOST_TIMES of the times, first and last among them: half of them evenly by number, half by logarithm."""
     count = len(times)
     if count <= MOST_TIMES:
