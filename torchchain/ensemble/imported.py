@@ -19,6 +19,8 @@ from torchchain.network import Network, NetworkTrajectory, PackingBands, packing
 
 PURE = 0.99
 """Share of the energy in one band from which a run counts as one that starts in it alone."""
+ABSENT = 0.02
+"""Share in its own band below which a source is taken for another one's: sources in a wrong order."""
 SAME = 1e-3
 """Share by which the stiffness of a contact may differ between two runs of one chain."""
 NOISE, LOSS = 0.01, 0.2
@@ -60,7 +62,7 @@ def as_shares(times: Tensor, energies: Tensor) -> Tensor:
     own = energies[:, :, 0].mean(0).diagonal() / first.mean(0) if float(times[0]) == 0 else torch.ones(1)
     if float(own.min()) < PURE:
         words = f"{float(own.min()):.3g} of the energy of source {int(own.argmin()) + 1} in its own band at time 0"
-        if float(own.min()) < 0.5:
+        if float(own.min()) < ABSENT:
             raise checks.fail("energies", "start in the band of their source (other starts go into starts=)", words)
         warn("energies", f"{words}: starts=energies[:, :, 0] counts what is in the others")
     if float(energies.min()) < -NOISE:
