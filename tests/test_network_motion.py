@@ -374,3 +374,26 @@ def test_rattlers_are_found_recursively():
     assert nw.rattlers(nw.lattice("triangular", (4, 4))).sum() == 0
     chain = nw.Network(torch.ones(3, dtype=F64), [[0.0], [1.0], [2.0]], [[0, 1], [1, 2]])
     assert not bool(nw.rattlers(chain).any())
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "fixed"])
+def test_a_chain_is_the_network_in_one_dimension(boundary):
+    masses = tc.Disorder(strength=0.3).masses(24, 2, seed=4)
+    chain = tc.Chain(masses, boundary=boundary, damping=0.0)
+    network = replace(nw.lattice("chain", (24,), boundary=boundary), masses=masses)
+    torch.testing.assert_close(network.stiffness_matrix(), -chain.stiffness_matrix(), rtol=0, atol=0)  # K of Eq. 15 is -A
+    w, v = tc.normal_modes(chain).frequencies, tc.normal_modes(network).frequencies
+    torch.testing.assert_close(w, v, rtol=0, atol=1e-12)
+    state = tc.impulse(chain, site=7)
+    lifted = tc.State(state.displacement[..., None], state.velocity[..., None])
+    times = [0.0, 2.0, 30.0]
+    one = tc.evolve(chain, state, times, "chebyshev")
+    two = tc.evolve(network, lifted, times, "chebyshev")
+    torch.testing.assert_close(two.displacement[..., 0], one.displacement, rtol=0, atol=1e-12)
+    torch.testing.assert_close(two.velocity[..., 0], one.velocity, rtol=0, atol=1e-12)
+    for definition in ("site", "bond"):
+        energies = (tc.particle_energy(x, path, definition) for x, path in ((chain, one), (network, two)))
+        torch.testing.assert_close(*energies, rtol=0, atol=1e-12)
+    if boundary == "periodic":
+        shares = (tc.band_energy(x, path, 6) for x, path in ((chain, one), (network, two)))
+        torch.testing.assert_close(*shares, rtol=0, atol=1e-12)

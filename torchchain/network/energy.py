@@ -56,7 +56,8 @@ def particle_energy(network: Network, trajectory: Trajectory, definition: str = 
         network: the network of the trajectory.
         trajectory: displacement and velocity (*batch, time, particle, component).
         definition: "bond": half of the energy of each of its bonds (all of a bond to an anchor) besides the kinetic;
-            "site": u . K u / 2 instead, which is negative on many particles.
+            "site": u . K u / 2 instead, which is negative on many particles; of a network without anchors u is counted
+            from its center of mass, as the particle energies would otherwise grow with the drift of the whole.
 
     Example:
         >>> sheet = tc.lattice("triangular", (4, 4))
@@ -67,7 +68,9 @@ def particle_energy(network: Network, trajectory: Trajectory, definition: str = 
     checks.choice("definition", definition, DEFINITIONS)
     kinetic = kinetic_energy(network, trajectory)
     if definition == "site":
-        return kinetic - (network.force(trajectory.displacement) * trajectory.displacement).sum(-1) / 2
+        displacement = trajectory.displacement
+        place = displacement if network.n_anchors else displacement - center_of_mass(network, displacement)
+        return kinetic - (network.force(displacement) * place).sum(-1) / 2
     bond = network.bond_energy(trajectory.displacement)
     i, j = network.bonds.unbind(-1)
     n = network.n_particles
@@ -75,6 +78,12 @@ def particle_energy(network: Network, trajectory: Trajectory, definition: str = 
     stored = bond.new_zeros(*bond.shape[:-1], n + network.n_anchors)
     stored = stored.index_add(-1, i, share).index_add(-1, j, share)
     return kinetic + stored[..., :n]
+
+
+def center_of_mass(network: Network, displacement: Tensor) -> Tensor:
+    """How far the center of mass has moved, (*batch, *any, 1, component)."""
+    masses = network.align(network.masses, displacement)
+    return (masses * displacement).sum(-2, keepdim=True) / masses.sum(-2, keepdim=True)
 
 
 def total_energy(network: Network, trajectory: Trajectory) -> Tensor:
