@@ -180,6 +180,7 @@ XYZS = {
     "xyz: time of a word": ("a.xyz", swap(XYZ, "Time=0.5", "Time=late"), "frame 2: Time"),
     "xyz: time backwards": ("a.xyz", swap(XYZ, "Time=0.5", "Time=-0.5"), "frame 2: time"),
     "xyz: properties of no kind": ("a.xyz", swap(XYZ, "pos:R:3", "pos:Q:3"), "frame 1: rows"),
+    "xyz: billions of columns": ("a.xyz", swap(XYZ, "pos:R:3", "pos:R:" + "9" * 12), "frame 1: Properties"),
     "xyz: masses in threes": ("a.xyz", XYZ.replace("velo:R:3:mass:R:1", "velo:R:1:mass:R:3"), "frame 1: "),
     "xyz: cut in the only frame": ("a.xyz", XYZ[:110], "frame 1"),
 }

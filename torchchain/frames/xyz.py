@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import io
+import re
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ NAMES = {
     "id": ("id", "ids", "particle_identifier"), "mass": ("mass", "masses"), "radius": ("radius", "radii"),
     "velocity": ("velo", "vel", "velocity", "velocities"),
 }  # fmt: skip
+MOST_DIGITS = 4
 TIMES, STEPS = ("time", "Time"), ("step", "Step", "timestep", "Timestep")
 
 
@@ -51,6 +53,11 @@ def _frame(text: Text, number: int, ase: Any, whole: bool) -> tuple[int, Any] | 
     comment = text.line()
     if comment is None:
         raise CutShort
+    wide = re.search(rf"[SRIL]\s*:\s*(\d{{{MOST_DIGITS + 1},}})", comment, re.IGNORECASE)
+    if wide:  # ase would make room for as many columns
+        raise checks.fail(
+            f"{here}: Properties", f"have widths of at most {MOST_DIGITS} digits", checks.shown(wide[1], 40)
+        )
     if whole:
         rows = b"".join(text.blocks(count)).decode("latin-1")
     else:
