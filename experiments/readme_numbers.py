@@ -43,6 +43,8 @@ class Number:
     low: float
     high: float
     fast: bool = False
+    seeds: int = 1
+    """it holds for so many seeds, the first being that asked for"""
 
 
 def row(*parts: str) -> Read:
@@ -104,9 +106,16 @@ NUMBERS = (
     Number("the default model (`memory`) 0.017", "calibration_methods", row("projection: memory"), 0.013, 0.020),
     Number("98 of 100 varied scenes", "plan_grid", row("choice takes at most 1.5"), 0.90, 1.0),
     Number("in all it keeps to the", "plan_grid", row("keeps to the tolerance"), 1.0, 1.0),
-    Number("0.15 to 0.26 times the chains, by seed", "chart_ensemble", chains("opposite masses"), 0.12, 0.30),
-    Number("shifted starts 0.93 to 1.3 times", "chart_ensemble", chains(" starts"), 0.85, 1.4),
+    Number("0.14 to 0.24 times the chains, by seed", "chart_ensemble", chains("opposite masses"), 0.12, 0.28, seeds=3),
+    Number("shifted starts 0.93 to 1.3 times", "chart_ensemble", chains(" starts"), 0.9, 1.35, seeds=3),
 )  # fmt: skip
+
+
+def documents() -> str:
+    """README.md and docs/*.md as one line, so that a number may move from one to another."""
+    root = FOLDER.parent
+    texts = (path.read_text(encoding="utf-8") for path in (root / "README.md", *sorted((root / "docs").glob("*.md"))))
+    return " ".join(" ".join(texts).split())
 
 
 def made(command: str, out: Path, seed: int) -> Path:
@@ -125,22 +134,23 @@ def made(command: str, out: Path, seed: int) -> Path:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print one line for each number, and return the exit status."""
     flags = tyro.cli(Flags, args=arguments)
-    root = FOLDER.parent
-    texts = (path.read_text(encoding="utf-8") for path in (root / "README.md", *sorted((root / "docs").glob("*.md"))))
-    readme = " ".join(" ".join(texts).split())
+    readme = documents()
     asked = [number for number in NUMBERS if flags.all or number.fast]
-    folders: dict[str, Path] = {}
+    folders: dict[tuple[str, int], Path] = {}
     failed = 0
     for number in asked:
-        if number.command not in folders:
-            folder = Path(flags.out) / number.command.split()[-1]
-            folders[number.command] = made(number.command, folder, flags.seed)
-        value = number.read(folders[number.command])
+        values = []
+        for seed in range(flags.seed, flags.seed + number.seeds):
+            if (number.command, seed) not in folders:
+                folder = Path(flags.out) / f"{number.command.split()[-1]}-{seed}"
+                folders[number.command, seed] = made(number.command, folder, seed)
+            values.append(number.read(folders[number.command, seed]))
         stated = number.said in readme
-        good = stated and number.low <= value <= number.high
+        good = stated and all(number.low <= value <= number.high for value in values)
         failed += not good
         verdict = "ok" if good else "NOT STATED" if not stated else "FAILS"
-        print(f"{verdict:<13} {value:<10.4g} {number.low:g} to {number.high:g}  {number.said}", flush=True)
+        found = ", ".join(f"{value:.4g}" for value in values)
+        print(f"{verdict:<13} {found:<20} {number.low:g} to {number.high:g}  {number.said}", flush=True)
     if not flags.all:
         print(f"{len(NUMBERS) - len(asked)} more with --all")
     return int(bool(failed))

@@ -22,6 +22,7 @@ import fig09
 import fig12
 import fig14
 import harness
+import readme_numbers
 import run_all
 
 FILES = ("config.toml", "results.nc", "figure.png", "report.txt", "run.json")
@@ -135,6 +136,27 @@ def test_redraw_keeps_the_settings(tmp_path, capsys):
     capsys.readouterr()
     assert fig12.main(["--redraw", "--seed", "7", *out]) == 2
     assert "seed must stay 0" in capsys.readouterr().err
+
+
+def test_numbers_of_the_documents_are_stated_and_read(monkeypatch, tmp_path, capsys):
+    stated = readme_numbers.documents()
+    for number in readme_numbers.NUMBERS:
+        assert number.said in stated
+        assert number.command == readme_numbers.HEADLINE or number.command in run_all.names()
+        assert number.low < number.high or number.low == 1
+    asked = []
+    monkeypatch.setattr(readme_numbers, "made", lambda command, out, seed: asked.append((command, seed)) or out)
+    table = [
+        readme_numbers.Number("98 of 100", "plan_grid", lambda out: 0.5, 0.4, 0.6, True, seeds=3),
+        readme_numbers.Number("98 of 100", "plan_grid", lambda out: 0.7, 0.4, 0.6, True),
+        readme_numbers.Number("99 of 98", "plan_grid", lambda out: 0.5, 0.4, 0.6, True),
+        readme_numbers.Number("98 of 100", "growth", lambda out: 0.5, 0.4, 0.6),
+    ]
+    monkeypatch.setattr(readme_numbers, "NUMBERS", table)
+    assert readme_numbers.main(["--out", str(tmp_path)]) == 1
+    assert asked == [("plan_grid", 0), ("plan_grid", 1), ("plan_grid", 2)]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in lines] == ["ok", "FAILS", "NOT STATED", "1 more with --all"]
 
 
 def test_run_all_reports_a_failure(tmp_path, capsys, monkeypatch):
