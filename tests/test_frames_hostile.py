@@ -325,7 +325,17 @@ def test_bad_restarts(case, written):
 
 # netCDF
 
+def announce(file, shape):
+    """Positions of another shape, none of them stored."""
+    axes = file["position"].attrs["axes"]
+    del file["position"]
+    file.create_dataset("position", shape, "f8", chunks=(1, min(1000, shape[1]), 1)).attrs["axes"] = axes
+
+
 NETCDF = {
+    "billions of frames": (lambda file: announce(file, (10**11, N, 1)), "position"),
+    "billions of particles": (lambda file: announce(file, (2, 10**11, 1)), "position"),
+    "billions of contacts": (lambda file: file["contact_frame"].resize((10**11,)), "contact_frame"),
     "another netCDF": (lambda file: file.attrs.__setitem__("layout", "none"), "layout"),
     "no ids": (lambda file: file.__delitem__("id"), "layout"),
     "other axes": (lambda file: file["position"].attrs.__setitem__("axes", "q"), "position"),

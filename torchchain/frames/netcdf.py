@@ -15,6 +15,7 @@ from torchchain import checks
 from torchchain.frames.lammps import where
 from torchchain.frames.record import AXES, Box, Frame
 from torchchain.frames.registry import Entry, Format, Raw, Scan
+from torchchain.frames.text import GZIP_RATIO
 
 LAYOUT = "torchchain frames 1"
 BLOCK = 1 << 21  # bytes of positions that are written and read together
@@ -158,6 +159,10 @@ def _scan(path: Path, options: dict[str, Any]) -> Scan:
         shape = file["position"].shape
         if len(shape) != 3:
             raise checks.fail(f"{path.name}: position", "have axes time, particle and axis", f"shape {shape}")
+        room = GZIP_RATIO * path.stat().st_size
+        for name in file:
+            if _holds(file, name) and file[name].nbytes > room:
+                raise checks.fail(f"{path.name}: {name}", "fit into the file", f"shape {file[name].shape}")
         n_frames, n, d = shape
         shapes = {
             "position": shape, "velocity": shape, "time": (n_frames,), "step": (n_frames,), "id": (n,), "mass": (n,), "radius": (n,),
