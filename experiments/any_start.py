@@ -101,19 +101,20 @@ def starts(config: Config) -> dict[str, tc.State]:
 
 def ensemble(config: Config, start: tc.State, times: Tensor, seed: int) -> tuple[Tensor, Tensor]:
     """Mean energies over their mean total, and their standard errors, (start, time, band)."""
-    disorder, sums = tc.Disorder(strength=config.strength), []
-    for first in range(0, config.fresh, CHAINS):
-        count = range(first, min(first + CHAINS, config.fresh))
-        chain = tc.Chain(disorder.masses(config.n_particles, count, seed))
-        here = tc.State(*(x.expand(len(count), *x.shape) for x in (start.displacement, start.velocity)))
+    disorder, count = tc.Disorder(strength=config.strength), config.fresh
+    sums: list[Tensor] = []
+    for first in range(0, count, CHAINS):
+        numbers = range(first, min(first + CHAINS, count))
+        chain = tc.Chain(disorder.masses(config.n_particles, numbers, seed))
+        here = tc.State(*(x.expand(len(numbers), *x.shape) for x in (start.displacement, start.velocity)))
         energy = band_energy(chain, here, times, config.n_bands, normalize=False)
-        total = tc.total_energy(chain, tc.Trajectory(times[:1], *(x[..., None, :] for x in (here.displacement, here.velocity))))  # fmt: skip
-        sums.append(torch.cat([energy, total[..., None].expand(*energy.shape[:-1], 1)], -1))
-    every = torch.cat(sums)
-    mean = every.mean(0)
-    share = mean[..., :-1] / mean[..., -1:]
-    apart = every[..., :-1] - share * every[..., -1:]  # of a ratio of means
-    return share, apart.square().mean(0).sqrt() / mean[..., -1:] / math.sqrt(len(every) - 1)
+        total = tc.start_energy(chain, here).total[..., None, None]
+        parts = [x.sum(0) for x in (energy, energy.square(), energy * total, total, total.square())]
+        sums = [a + b for a, b in zip(sums, parts, strict=True)] if sums else parts
+    mean, square, cross, whole, whole_square = (x / count for x in sums)
+    share = mean / whole  # and the error of a ratio of means
+    spread = (square - 2 * share * cross + share.square() * whole_square).clamp(min=0).sqrt()
+    return share, spread / whole / math.sqrt(count - 1)
 
 
 def measure(config: Config, device: str) -> xarray.Dataset:

@@ -167,7 +167,11 @@ def test_other_starts_do_not_depend_on_the_cut_and_leave_the_rest_as_it_is(trans
 
 
 @pytest.mark.parametrize(
-    "changes", [{"boundary": "fixed"}, {"damping": 0.1}, {"realizations": 15}, {"lattice": "square", "shape": (8, 8)}]
+    "changes",
+    [
+        {"boundary": "fixed"}, {"damping": 0.1}, {"realizations": 15}, {"energy_definition": "bond"},
+        {"lattice": "square", "shape": (8, 8)},
+    ],
 )
 def test_where_other_starts_are_not_measured(changes):
     small = {"n_particles": 16, "n_bands": 4, "realizations": 16, "times": [0.0, 1.0]} | changes
