@@ -80,8 +80,7 @@ def starts(config: Config) -> dict[str, tc.State]:
     slope = -(place - n / 2) / (n / 16) ** 2  # the envelope moves at the group velocity cos(k / 2)
     packet = envelope * torch.sin(k * place)
     moving = -2 * torch.sin(k / 2) * envelope * torch.cos(k * place) - torch.cos(k / 2) * slope * packet
-    bead = torch.zeros(1, n, dtype=torch.float64)
-    bead[0, n // 2] = 1.0
+    bead = torch.eye(n, dtype=torch.float64)[:: n // 4]
     noise = torch.randn(2, 4, n, generator=draw, dtype=torch.float64)
     pairs_of = {
         "calibrated tone, sine": (sine, None), "calibrated tone, cosine": (wave(tones, quarter), None),

@@ -211,7 +211,7 @@ def random_model(seed=0, degrees=(4, 3, 6)):
     draw, tones = np.random.default_rng(seed), Tones.of(N, B, 0.3)
     numbers = [torch.from_numpy(draw.normal(0, 0.5, n_coefficients(degrees))) for _ in range(2)]
     none = torch.zeros(0, dtype=torch.float64)
-    return StartModel(torch.tensor(degrees).double(), *numbers, tones.frequency, tones.decay, tones.coupling, none, none.expand(2, 0), B)
+    return StartModel(torch.tensor(degrees).double(), *numbers, tones.frequency, tones.decay, tones.coupling, none, none.expand(2, 2, 0), B)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -331,7 +331,7 @@ def test_the_file_holds_both_transfers(master, tmp_path):
         ("starts.decay", torch.zeros(32), "starts.decay must be positive"),
         ("starts.released", torch.ones(5).double(), "starts.released must have shape"),
         ("starts.frequency", torch.ones(31).double(), "starts.decay must have shape"),
-        ("starts.scale", torch.full((2, 24), -1.0), "starts.scale must hold factors"),
+        ("starts.scale", torch.full((2, 2, 24), -1.0), "starts.scale must hold factors"),
         ("starts.kicked", torch.full((10,), torch.nan).double(), "starts.kicked must"),
     ],
 )

@@ -38,6 +38,8 @@ STEP = 1e-3
 """Of the derivative by time, relative to the time at which the state is looked at, and in time units at most."""
 TOGETHER = 2**22
 """Pairs of tones times times that are computed at once."""
+FOLLOWED = 0.125
+"""Share of the data's variance, which is much the same at neighboring times, that stays in the smooth functions fitted to them."""
 EVENNESS = 0.5
 """Weight of a source's own error in a fit, rather than of the mean over sources."""
 
@@ -53,13 +55,13 @@ class StartModel(nn.Module):
         frequency, decay: of the waves of tones 1 to N / 2, (tone,).
         coupling: variance of the disorder for each tone.
         n_bands: B.
-        scale_times, scale: factors by which the errors of T and T' exceed those of the bands' own model at some times,
-            (start_time,) and (kind, start_time); no times if unknown.
+        scale_times, scale: errors of T and T' over those of the bands' own model, in the source's own band and in others,
+            at some times, (start_time,) and (kind, part, start_time); no times if unknown.
     """
 
     AXES: ClassVar[dict[str, tuple[str, ...]]] = {
         "degrees": ("degree",), "released": ("term",), "kicked": ("term",), "frequency": ("start_tone",), "decay": ("start_tone",),
-        "coupling": (), "scale_times": ("start_time",), "scale": ("kind", "start_time"),
+        "coupling": (), "scale_times": ("start_time",), "scale": ("kind", "part", "start_time"),
     }  # fmt: skip
 
     def __init__(
@@ -73,7 +75,7 @@ class StartModel(nn.Module):
         shapes = {
             "released": (released, (size,)), "kicked": (kicked, (size,)), "frequency": (frequency, (count,)),
             "decay": (decay, (count,)), "coupling": (coupling, ()), "scale_times": (scale_times, (len(scale_times),)),
-            "scale": (scale, (2, len(scale_times))),
+            "scale": (scale, (2, 2, len(scale_times))),
         }  # fmt: skip
         for name, (value, shape) in shapes.items():
             value = checks.real_tensor(f"starts.{name}", value).double()
@@ -159,22 +161,29 @@ class StartModel(nn.Module):
     def standard_error(self, start: StartEnergy, times: Tensor, uncertainty: Uncertainty) -> Tensor:
         """Standard error of :meth:`solve`, (*batch, time, band), from that of the bands' own model.
 
-        Tones of one band have the same error, bands have errors of their own.
+        Tones of one band have the same error, released or kicked, and bands have errors of their own.
         """
         self.check(start)
         times = times.to(self.released)
-        total = self.released.new_zeros(*start.rigid.shape, len(times), self.n_bands)
         width = start.potential.shape[-1] // self.n_bands
+        each = uncertainty.of(torch.eye(self.n_bands).to(times), times).square()
+        own = torch.eye(self.n_bands, device=times.device)[:, None].expand_as(each) > 0
+        total = self.released.new_zeros(*start.rigid.shape, len(times), self.n_bands)
+        energies, factors = [], []
         for row, name in enumerate(("potential", "kinetic")):
             values = getattr(start, name).to(self.released)
-            bands = values.reshape(*values.shape[:-1], self.n_bands, width).sum(-1)
-            total = total + uncertainty.of(bands, times).square() * self._scale(row, times).square()[:, None]
+            energies.append(values.reshape(*values.shape[:-1], self.n_bands, width).sum(-1))
+            inside, outside = (self._scale(row, part, times)[:, None] for part in range(2))
+            factors.append(torch.where(own, inside, outside))
+        for i, j in ((0, 0), (1, 1), (0, 1), (1, 0)):
+            both = energies[i] * energies[j]
+            total = total + torch.einsum("...s,str->...tr", both, each * factors[i] * factors[j])
         return total.sqrt()
 
-    def _scale(self, row: int, times: Tensor) -> Tensor:
+    def _scale(self, row: int, part: int, times: Tensor) -> Tensor:
         if not len(self.scale_times):
             return torch.ones_like(times)
-        found = np.interp(times.cpu().numpy(), self.scale_times.cpu().numpy(), self.scale[row].cpu().numpy())
+        found = np.interp(times.cpu().numpy(), self.scale_times.cpu().numpy(), self.scale[row, part].cpu().numpy())
         return torch.from_numpy(found).to(times)
 
     def check(self, start: StartEnergy) -> None:
@@ -232,7 +241,7 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
     none = torch.zeros(0, dtype=torch.float64)
     return StartModel(
         torch.tensor(degrees, dtype=torch.float64), **coefficients, frequency=tones.frequency, decay=tones.decay,
-        coupling=tones.coupling, scale_times=none, scale=none.expand(2, 0), n_bands=scene.n_bands,
+        coupling=tones.coupling, scale_times=none, scale=none.expand(2, 2, 0), n_bands=scene.n_bands,
     )  # fmt: skip
 
 
@@ -245,27 +254,27 @@ def _weights(stderr: Tensor) -> Tensor:
 
 
 def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertainty) -> StartModel:
-    """The model with the factors by which its errors exceed those of the bands' own model.
+    """The model with its errors, as factors to those of the bands' own model.
 
-    Where it was fitted to fewer samples they are larger, and where it misses its data by more than their noise explains.
+    They hold what the model misses its data by beyond their noise, and the share of that noise that the fit has followed.
     """
     starts, scene = transfer.starts, transfer.scene
     assert starts is not None, "the model was fitted to them"
     assert scene is not None, "and of these chains"
-    times, width = starts.times[1:], scene.n_particles // 2 // scene.n_bands
-    base = uncertainty.of(torch.eye(scene.n_bands, dtype=torch.float64), times)
-    numbers = torch.tensor(starts.tones) - 1
+    times, n = starts.times[1:], scene.n_bands
+    base = uncertainty.of(torch.eye(n, dtype=torch.float64), times).square()
+    numbers, own = torch.tensor(starts.tones) - 1, torch.eye(n, dtype=torch.bool)[:, None].expand_as(base)
     center = torch.isin(numbers, torch.tensor(scene.tones) - 1)
-    sets = [center, ~center] if width > 1 else [center]
-    fewer = sum(transfer.block_counts) / starts.samples / len(sets)
-    rows = []
-    for kind in KINDS:
-        spread = base * (max(1.0, math.sqrt(fewer)) if kind == KINDS[1] else 1.0)
-        total = torch.zeros_like(times)
+    sets = [center, ~center] if bool((~center).any()) else [center]
+    rows = torch.ones(len(KINDS), 2, len(times), dtype=torch.float64)
+    for row, kind in zip(rows, KINDS, strict=True):
+        error = torch.zeros_like(base)
         for one in sets:
             found = model.transfer(kind, (numbers[one] + 1).tolist(), times)
             mean, stderr = (getattr(starts, name)[one, 1:] for name in (kind, f"{kind}_stderr"))
-            own = model_error(found, mean, stderr, torch.minimum(spread, stderr))
-            total += (spread.square() + own.square()).sum((0, 2)) / len(sets)
-        rows.append((total / base.square().sum((0, 2)).clamp(min=1e-300)).sqrt())
-    return StartModel(**model.tensors() | {"scale_times": times, "scale": torch.stack(rows)}, n_bands=model.n_bands)
+            followed = math.sqrt(FOLLOWED) * stderr
+            error += (followed.square() + model_error(found, mean, stderr, followed).square()) / len(sets)
+        for part, factor in zip((own, ~own), row, strict=True):
+            here, there = ((x * part).sum((0, 2)) for x in (error, base))
+            factor.copy_((here / there.clamp(min=1e-30)).sqrt())
+    return StartModel(**model.tensors() | {"scale_times": times, "scale": rows}, n_bands=n)
