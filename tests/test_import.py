@@ -407,6 +407,51 @@ def test_masses_by_flags(kind, run, tmp_path):
 
 
 @pytest.mark.usefixtures("no_drawing")
+def test_mercury_runs_by_the_command(run, tmp_path):
+    """Masses from the .restart beside a run, a box that the user says is periodic, contacts from .fstat."""
+    ring = scene(realizations=2).chain(range(2))
+    path = moved(ring, scene().state(ring))
+    rest, radius = torch.arange(N) + 0.5, 0.55
+    for r, masses in enumerate(ring.masses):
+        restart = "MercuryDPM 1.0 name run\nxMin 0\n" + f"Particles {N}\n" + "".join(
+            f"SphericalParticle id {i} indSpecies 0 position 0 0 0 radius {radius} invMass {1 / m:.17g} timeStamp 0\n"
+            for i, m in enumerate(masses.tolist())
+        )  # fmt: skip
+        for s in range(B):
+            for name, moves in ((f"run{r}-{s}", range(len(TIMES))), (f"rest{r}-{s}", [None])):
+                data = contacts = ""
+                for k in moves:
+                    x, v = (
+                        (rest, 0 * rest) if k is None else (rest + path.displacement[r, s, k], path.velocity[r, s, k])
+                    )
+                    data += f"{N} {k or 0} 0 -1 -1 {N} 1 1 \n"
+                    data += "".join(
+                        f"{a % N:.17g} 0 0 {b:.17g} 0 0 {radius} 0 0 0 0 0 0 0\n"
+                        for a, b in zip(x.tolist(), v.tolist(), strict=True)
+                    )
+                    contacts += f"# {k or 0} 1\n# 0 -1 -1 {N} 1 1\n# {radius} {radius} 0 0 0 0\n"
+                    for i in range(N):
+                        overlap = 2 * radius - float((x.roll(-1) - x)[i] % N)
+                        for a, b in ((i, (i + 1) % N), ((i + 1) % N, i)):
+                            contacts += f"0 {a} {b} 0 0 0 {overlap:.17g} 0 {overlap:.17g} 0 1 0 0 0 0 0\n"
+                (tmp_path / f"{name}.data").write_text(data)
+                (tmp_path / f"{name}.fstat").write_text(contacts)
+                (tmp_path / f"{name}.restart").write_text(restart)
+    words = ["--reference", "rest{1}-{2}.data", "--periodic", "x", "--n-bands", B]
+    assert run("import", "run*.data", *words, "--out", "data")[::2] == (0, "")
+    exact = tc.BandTransfer.from_trajectories(ring, path, B)
+    found = tc.open("data").transfer
+    assert float((found.mean - exact.mean).abs().max()) < 1e-9
+    assert found.block_counts == exact.block_counts
+    # Stiffness 1 and overlap 0.1 from the contact lists, and the mean mass: the same chains in other units of time.
+    words += ["--contacts", "{stem}.fstat", "--units", "linear"]
+    assert run("import", "run*.data", *words, "--out", "scaled")[::2] == (0, "")
+    scaled = tc.open("scaled").transfer
+    assert scaled.block_counts == exact.block_counts
+    assert float(scaled.times[-1] / found.times[-1]) == pytest.approx(float(ring.masses.mean()) ** -0.5, rel=1e-9)
+
+
+@pytest.mark.usefixtures("no_drawing")
 def test_doubts_that_many_runs_share_are_told_once(run, tmp_path):
     """Damped runs of a chain that is said not to be, until the damping is named."""
     ring = scene(realizations=2).chain(range(2))

@@ -1,4 +1,4 @@
-"""LIGGGHTS contact lists: ``dump ... local`` of ``compute pair/gran/local``."""
+"""LIGGGHTS contact lists: ``dump ... local`` of ``compute pair/gran/local``, as its ComputePairGranLocal (add_pair) writes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""MercuryDPM: ``.data`` files of particles, with masses from the ``.restart`` beside them."""
+"""MercuryDPM: ``.data`` files of particles, with masses from the ``.restart`` beside them.
+
+Layouts as its DPMBase (outputXBallsData, readNextDataFile) and BaseParticle (write) have them, of version 1.0 and later.
+"""
 
 from __future__ import annotations
 

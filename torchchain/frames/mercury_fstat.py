@@ -1,4 +1,4 @@
-"""MercuryDPM: ``.fstat`` files of contacts."""
+"""MercuryDPM: ``.fstat`` files of contacts, in the layout of its DPMBase (writeFstatHeader) and BaseInteraction (writeToFStat)."""
 
 from __future__ import annotations
 
