@@ -131,17 +131,18 @@ def paper_basis(sample: Sample) -> Tensor:
 
 
 def exact_psi(sample: Sample) -> Tensor:
-    """The exact infinite-time share of each source's own band on the diagonal, [source, receiver]."""
-    return torch.diag(exact_basis(sample).diagonal())
+    """The exact infinite-time share of each source's own band on the diagonal, [source, receiver]; noise past 0 and 1 is cut."""
+    return torch.diag(exact_basis(sample).diagonal().clamp(0, 1))
 
 
 def exact_basis(sample: Sample) -> Tensor:
-    """The exact infinite-time share of every source in every band, Pi [source, receiver]."""
+    """The exact infinite-time share of every source in every band, Pi [source, receiver]; rows of noisy data sum to 1 at most."""
     if sample.long_time is None:
         raise checks.fail(
             "transfer", "hold the long-time average for this model (band_transfer with long_time=True)", "none"
         )
-    return sample.long_time
+    total = sample.long_time.sum(-1, keepdim=True)
+    return torch.where(total > 1, sample.long_time / total, sample.long_time)
 
 
 def loss_rates(sample: Sample) -> Tensor:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchchain import checks
 from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import FitWarning
@@ -69,7 +70,9 @@ def select(
     noise = float(halves @ weight)
     tried: list[Rung] = []
     models: list[TransferModel] = []
+    chosen: list[Recipe] = []
     enough = False
+    refused: checks.FieldError | None = None
 
     def fitted(recipe: Recipe, sample: Sample, near: TransferModel | None = None) -> tuple[TransferModel, Tensor]:
         with warnings.catch_warnings():
@@ -80,7 +83,12 @@ def select(
     for candidate in candidates:
         record = candidate.model
         assert record is not None, "a rung names its model"
-        model, found = fitted(candidate, parts[0])
+        try:
+            model, found = fitted(candidate, parts[0])
+        except checks.FieldError as error:  # of half of the data no model of this kind can be made
+            refused = error
+            continue
+        chosen.append(candidate)
         missed = total_variation(found, parts[1].mean).mean(0)
         tried.append(Rung(record.name, candidate.order, float(missed @ weight)))
         models.append(model)
@@ -96,10 +104,13 @@ def select(
             )
         if enough:
             break
+    if not tried:
+        assert refused is not None, "there is at least one candidate"
+        raise refused
     best = len(tried) - 1 if enough else min(range(len(tried)), key=lambda i: tried[i].distance)
     reached = "reaches" if enough else "comes nearest to"
     reason = f"smallest model that {reached} the distance of the two halves of the ensemble"
-    return candidates[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best]
+    return chosen[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best]
 
 
 def foreseen(halves: Tensor, missed: Tensor, spread: Tensor) -> Tensor:
