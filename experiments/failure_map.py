@@ -22,7 +22,7 @@ from scipy import optimize, special
 from torch import Tensor
 
 import torchchain as tc
-from torchchain import checks
+from torchchain import checks, plots
 from torchchain.evolvers import chebyshev, ode, symplectic
 from torchchain.evolvers.symplectic4 import PEFRL
 from torchchain.evolvers.verlet import VERLET
@@ -525,8 +525,8 @@ COLORS = {"raises": "C0", "warns": "C1", "is right: a finite chain is not infini
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure = Figure(figsize=(13.5, 8.2), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
+    figure = Figure(figsize=(plots.PAGE, 10), layout="constrained")
+    left, right = figure.subplots(2, 1, height_ratios=(1.8, 1))
     _edges(left, data)
     _curves(right, data)
     return figure
@@ -540,7 +540,7 @@ def _edges(ax: Axes, data: xarray.Dataset) -> None:
         factor, ratio = float(one.factor), float(one.found / one.predicted)
         ax.fill_betweenx([y - 0.3, y + 0.3], 1 / factor, factor, color="0.88", linewidth=0)
         ax.plot(ratio, y, "o", color=COLORS[kind(str(one.answer.values), bool(one.by_design))])
-        labels.append(f"{one.method.values}: {one.quantity.values}")
+        labels.append(f"{one.method.values}: {one.quantity.values}".replace("^2", "²"))
     ax.axvline(1, color="k", linewidth=0.8)
     for name, color in COLORS.items():
         if name != "silent" or "silent" in {

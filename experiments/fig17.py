@@ -87,7 +87,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     maps = [(f"$\\xi$ = {xi:g}", data.rates.isel(strength=i).values) for i, xi in enumerate(config.strengths)]
     i = config.strengths.index(config.analytic)
     q0 = float(data.q0.isel(strength=i))
-    maps.insert(i + 1, (f"Eq. 50, $\\xi$ = {config.analytic:g}, $q_0$ = {q0:.4f}", q0 * data.profile.values))
+    maps.insert(i + 1, (f"Eq. 50, $\\xi$ = {config.analytic:g}", q0 * data.profile.values))
     columns = min(3, len(maps))
     figure, axes = harness.panels(-(-len(maps) // columns), columns, width=4.4, height=4.0)
     top = max(float(-rates.min()) for _, rates in maps)

@@ -78,20 +78,21 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(len(config.sources), len(SHOWN) + 1, width=4.3)
-    for row, source, letter in zip(axes, config.sources, "abcdef", strict=False):
+    figure, axes = harness.panels(len(config.sources), len(SHOWN) + 1, width=4.3, height=5.2)
+    for row, source in zip(axes, config.sources, strict=True):
         part = data.sel(source=source)
         for ax, kind in zip(row, SHOWN, strict=False):
             values = part.ensemble if kind == "ensemble" else part.energy.sel(model=kind)
-            title = kind if kind == "ensemble" else f"master equation, {kind}"
-            plots.band_map(ax, data.time.values, values.values, f"({letter}) source {source}: {title}")
+            title = "chains" if kind == "ensemble" else kind
+            plots.band_map(ax, data.time.values, values.values, f"source {source}: {title}")
         ax = row[-1]
         for model in MODELS:
-            ax.plot(data.time.values, part.distance.sel(model=model), label=f"master equation, {model}")
+            ax.plot(data.time.values, part.distance.sel(model=model), label=model)
         ax.plot(data.time.values, part.noise, "k:", label="another such ensemble")
-        ax.set(xlabel=plots.TIME_LABEL, ylabel="total variation", title=f"({letter}) source {source}: distance from it",
+        ax.set(xlabel=plots.TIME_LABEL, ylabel="total variation", title=f"source {source}: distance",
                ylim=(0, 0.6))  # fmt: skip
     axes[-1, -1].legend(fontsize="small")
+    plots.lettered(axes.flat)
     figure.suptitle(f"$\\xi$ = {config.strength:g}, {config.realizations} chains; Eq. 50 with $q_0$ = {config.q0:g}")
     return figure
 

@@ -131,10 +131,10 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     figure, axes = harness.panels(1, 2)
     for (case, xi, part), color in zip(each(data, config), ("C0", "C1", "C2", "C3", "C4", "C5"), strict=False):
         left, right = axes[0]
-        left.errorbar(part.wavenumber, part.rate, part.rate_stderr, fmt="o", color=color, label=f"{case}, xi = {xi:g}")
+        left.errorbar(part.wavenumber, part.rate, part.rate_stderr, fmt="o", color=color, label=f"{case}, $\\xi$ = {xi:g}")
         left.plot(part.wavenumber, part.born, color=color)
         right.errorbar(part.frequency, part.rate / part.born, part.rate_stderr / part.born, fmt="o-", color=color)
-    axes[0, 0].set(xscale="log", yscale="log", xlabel="|q|", ylabel="decay rate of the energy")
+    axes[0, 0].set(xscale="log", yscale="log", xlabel="$|q|$", ylabel="decay rate of the energy")
     axes[0, 0].legend(fontsize=7)
     axes[0, 1].axhspan(0.9, 1.1, color="0.9")
     axes[0, 1].set(xlabel="frequency", ylabel="measured / Born", ylim=(0.7, 1.3))

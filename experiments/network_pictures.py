@@ -21,6 +21,7 @@ from PIL import Image
 
 import torchchain as tc
 from torchchain import network as nw
+from torchchain import plots
 from torchchain.chain import State
 
 COLORS = 64  # of the animation
@@ -159,18 +160,18 @@ def disks(axis: Any, data: xarray.Dataset, energy: np.ndarray) -> EllipseCollect
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
     n = len(data.instant)
-    figure = Figure(figsize=(4 * max(n, 3), 8), layout="constrained")
+    figure = Figure(figsize=(plots.PAGE, 2 * plots.PAGE / max(n, 3) + 0.4), layout="constrained")
     axes = figure.subplots(2, max(n, 3), squeeze=False)
     for i, t in enumerate(data.instant.values):
         drawn = disks(axes[0, i], data, data.snap.values[i])
         axes[0, i].set_title(f"energy of the disks at t = {t:g}")
-    figure.colorbar(drawn, ax=axes[0, n - 1], label="energy^(1/4)")
+    figure.colorbar(drawn, ax=axes[0, n - 1], label="energy$^{1/4}$")
     axis = axes[1, 0]
     image = axis.pcolormesh(
         data.time, data.edges, data.shells.sum("polarization").values[:-1].T, cmap="viridis", vmax=0.2
     )
     figure.colorbar(image, ax=axis, label="share of the energy")
-    axis.set(xlabel="t", ylabel="|q|", title="a plane wave: energy over |q|")
+    axis.set(xlabel=plots.TIME_LABEL, ylabel="$|q|$", title="a plane wave: energy over |q|")
     for axis, name, p in ((axes[1, 1], "longitudinal", 0), (axes[1, 2], "transverse", 1)):
         image = axis.pcolormesh(
             data.q, data.w, np.log10(data.spectrum.values[p].T.clip(1e-3)), cmap="viridis", vmin=-1.5
@@ -179,7 +180,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         law = 3 - 2 * np.cos(q) - np.cos(q / 2) if p == 0 else 3 * (1 - np.cos(q / 2))
         axis.plot(q, np.sqrt(law), "w--", lw=1, label="ordered lattice")
         axis.legend(loc="lower right")
-        axis.set(xlabel="q along a bond", ylabel="w", title=f"{name} S(q, w), xi = {config.strength:g}")
+        axis.set(xlabel="$q$ along a bond", ylabel=r"$\omega$", title=rf"{name} $S(q, \omega)$, $\xi$ = {config.strength:g}")
         figure.colorbar(image, ax=axis, label="log10 S")
     return figure
 

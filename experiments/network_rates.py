@@ -154,7 +154,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
             if pick and label:
                 line = "-" if style == "lattice" else "--"
                 axis.plot(data.unknowns[pick], data.rate.sel(way=way)[pick] / 1e6, line + marker, label=label)
-    axis.set(xscale="log", yscale="log", xlabel="unknowns (triangular)", ylabel="10^6 bond updates / s")
+    axis.set(xscale="log", yscale="log", xlabel="unknowns (triangular)", ylabel="million bond updates / s")
     axis.legend(fontsize=7)
     return figure
 

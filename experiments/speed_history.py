@@ -1,7 +1,7 @@
 """Speed from version to version: measure, compare with the last file of experiments/charts, and keep: python experiments/speed_history.py [--keep].
 
-Each case is timed in turn with a piece of plain numpy and torch work, so that what is compared between files is a ratio that
-other machines and their load change little. A case that takes more than 1.3 times its last ratio is named, and the exit status is 1.
+Cases are timed in turn with a piece of plain numpy and torch work, and their processor time is compared in units of it, which other
+machines and their load change less than seconds. A case that takes more than 1.3 times its last ratio is named, and the exit status is 1.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Flags:
     keep: tyro.conf.FlagCreatePairsOff[bool] = False
     """write a file to the folder"""
     repeats: int = 7
-    """timings of a case, each beside one of the reference work; the median ratio counts"""
+    """timings of a case, each beside one of the reference work; medians count"""
     size: int = 1
     """1: some tenths of a second a case; 0: for tests"""
     folder: str = str(ROOT / "charts")
@@ -90,7 +90,8 @@ def cases(size: int) -> dict[str, Callable[[], Any]]:
 
 def measured(flags: Flags) -> dict[str, Any]:
     """Seconds of processor time and ratios to the reference work, with the machine and the versions that they are of."""
-    rows = {}
+    seconds: dict[str, float] = {}
+    units: list[float] = []
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -98,14 +99,15 @@ def measured(flags: Flags) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             for name, run in cases(flags.size).items():
                 run()
-                ratios, seconds = [], []
+                spent = []
                 for _ in range(flags.repeats):
-                    unit, spent = timed(reference), timed(run)
-                    seconds.append(spent)
-                    ratios.append(spent / unit)
-                rows[name] = {"seconds": round(statistics.median(seconds), 6), "ratio": round(statistics.median(ratios), 4)}
+                    units.append(timed(reference))
+                    spent.append(timed(run))
+                seconds[name] = statistics.median(spent)
     finally:
         torch.set_num_threads(before)
+    unit = statistics.median(units)
+    rows = {name: {"seconds": round(spent, 6), "ratio": round(spent / unit, 4)} for name, spent in seconds.items()}
     return {"measured": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "machine": machine(), "size": flags.size, "cases": rows}
 
 
