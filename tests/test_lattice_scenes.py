@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 import xarray
+from test_ranks import Lost
 
 import torchchain as tc
 from torchchain import cli
 from torchchain import network as nw
 from torchchain.ensemble.checkpoint import Checkpoint
-from torchchain.ensemble.ranks import Ranks
 from torchchain.ensemble.transfer import measured_observables
 
 TIMES = [0.0, 0.5, 3.0, 12.0]
@@ -81,19 +81,6 @@ def test_a_kick_in_space(method):
     torch.testing.assert_close(torch.from_numpy(found.spread.values), spread, rtol=1e-8, atol=1e-12)
     assert found.radius.values[1:].max() < away.max()
     assert (found.front.diff("time") >= 0).all()  # no ring has gone round and come back so soon
-
-
-class Lost(Ranks):
-    """A process whose neighbors end before the moments meet."""
-
-    begin = None
-
-    def agree(self, value):
-        Lost.begin = value if self.rank == 0 else Lost.begin
-        return Lost.begin
-
-    def total(self, moments):
-        raise RuntimeError("another process of this run has ended")
 
 
 @pytest.mark.parametrize("disorder", ["masses", "moved particles"])
