@@ -114,7 +114,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     kills: list[tuple[float, ...]] = []
     jobs: list[tuple[float, ...]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        for command in COMMANDS:  # the first processes load what is loaded late
+        for command in COMMANDS if config != SMOKE else ():  # the first processes load what is loaded late
             ended(begun(arguments(SMOKE, command, Path(scratch) / "first")), 3600.0)
         for index, command in enumerate(COMMANDS):
             whole = Path(scratch) / command

@@ -1,7 +1,10 @@
-"""What the tests share: one thread, a small ensemble."""
+"""What the tests share: one thread, one look at the flags' sources, a small ensemble."""
+
+from functools import cache
 
 import pytest
 import torch
+import tyro
 
 import torchchain as tc
 from torchchain import cli
@@ -15,6 +18,15 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_look_at_sources():
+    """For comments beside flags tyro reads the sources of their classes anew in every call: half of its time."""
+    with pytest.MonkeyPatch.context() as patch:
+        source = tyro._docstrings._ClassTokenization
+        patch.setattr(source, "make", staticmethod(cache(source.make)))
+        yield
 
 
 @pytest.fixture(scope="session")

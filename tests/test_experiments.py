@@ -9,6 +9,7 @@ import re
 import sys
 import tomllib
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from matplotlib.text import Text
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "experiments"))
 
+import chart_summary
 import fig09
 import fig12
 import fig14
@@ -36,14 +38,29 @@ SCRIPTS = {
 }
 
 
-@pytest.fixture(scope="module", params=SCRIPTS)
-def done(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory):
+    """Smoke run of a script, made once; returns its folder."""
+    folder = tmp_path_factory.mktemp("experiments")
+
+    @cache
+    def run(name):
+        arguments = ["--smoke", "--out", str(folder / name)]
+        if name == "chart_summary":
+            for chart in chart_summary.CHARTS:
+                run(chart.SCRIPT.name)
+            arguments += ["--results", str(folder)]
+        good, line = run_all.run_one(name, arguments)
+        assert good, line
+        return folder / name
+
+    return run
+
+
+@pytest.fixture(params=SCRIPTS)
+def done(request, smoke):
     """A script and the folder of its smoke run."""
-    name = request.param
-    out = tmp_path_factory.mktemp("experiments") / name
-    good, line = run_all.run_one(name, ["--smoke", "--out", str(out)])
-    assert good, line
-    return SCRIPTS[name], out
+    return SCRIPTS[request.param], smoke(request.param)
 
 
 def table(out: Path) -> xarray.Dataset:

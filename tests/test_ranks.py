@@ -22,14 +22,20 @@ FIT = "--fit linear --model paper --bootstrap 0".split()  # quick
 pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
 
 
-def torchrun(n, folder, *arguments, restarts=0, program=("-m", "torchchain")):
-    """The command on n processes; returns what is left of it when it has ended."""
+def python(folder, *arguments):
+    """Python in a folder; returns what is left of it when it has ended."""
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
-    launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={n}", f"--max-restarts={restarts}"]
     return subprocess.run(
-        [sys.executable, *launcher, *program, *arguments],
+        [sys.executable, *arguments],
         cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=300,
     )  # fmt: skip
+
+
+def torchrun(n, folder, *arguments):
+    """The command on n processes."""
+    return python(
+        folder, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={n}", "-m", "torchchain", *arguments
+    )
 
 
 def data_of(path):
@@ -64,6 +70,8 @@ def test_two_processes(tmp_path, alone):
 
 DEATH = """
 import itertools, os, signal, sys
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+from torchchain.cli import dispatch
 from torchchain import cli
 from torchchain.ensemble import run as ensemble
 
@@ -74,15 +82,23 @@ def deadly(total, part):
     if os.environ["RANK"] == "1" and os.environ["TORCHELASTIC_RESTART_COUNT"] == "0" and next(left) <= 0:
         os.kill(os.getpid(), signal.SIGKILL)
 
-ensemble.EnsembleMoments.absorb = deadly
-sys.exit(cli.main(sys.argv[1:]))
+def work():
+    ensemble.EnsembleMoments.absorb = deadly
+    sys.exit(cli.main(sys.argv[1:]))
+
+config = LaunchConfig(
+    1, 1, nproc_per_node=3, run_id="death", rdzv_backend="c10d", rdzv_endpoint="localhost:0", max_restarts=1,
+    start_method="fork", monitor_interval=0.1,
+)
+elastic_launch(config, work)()
 """
+"""What torchrun does, with processes forked from one that has imported the libraries already."""
 
 
 def test_a_process_that_dies_is_started_again_and_goes_on(tmp_path, alone):
     (tmp_path / "death.py").write_text(DEATH)
     arguments = ["simulate", *FLAGS, "--checkpoint-every", "0", "--out", "three"]
-    done = torchrun(3, tmp_path, *arguments, restarts=1, program=("death.py",))
+    done = python(tmp_path, "death.py", *arguments)
     assert done.returncode == 0, done.stderr
     assert data_of(tmp_path / "three" / "results.nc") == data_of(alone("simulate", *FLAGS, out="one") / "results.nc")
     record = json.loads((tmp_path / "three" / "run.json").read_text())
