@@ -7,7 +7,7 @@ import gzip
 import io
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -275,7 +275,7 @@ def parse(
     return {name: part[0] if len(part) == 1 else np.concatenate(part) for name, part in parts.items()}
 
 
-def _plain(block: bytes, rows: int, width: int, kinds: dict[int, type]) -> dict[int, np.ndarray] | None:
+def _plain(block: bytes, rows: int, width: int, kinds: Mapping[int, type]) -> dict[int, np.ndarray] | None:
     """The wanted columns of a few good rows, for which starting a parser takes longer than parsing; None for others."""
     words = block.split()
     # Where a word begins and a line ends: as many words in every line.
@@ -287,7 +287,7 @@ def _plain(block: bytes, rows: int, width: int, kinds: dict[int, type]) -> dict[
         return None
     table = np.array(words).reshape(rows, width)
     try:
-        found = {i: table[:, i].astype(kind) for i, kind in kinds.items()}
+        found: dict[int, np.ndarray] = {i: table[:, i].astype(kind) for i, kind in kinds.items()}
     except (ValueError, OverflowError):
         return None
     return found if all(np.isfinite(values).all() for values in found.values()) else None
