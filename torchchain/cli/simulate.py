@@ -85,7 +85,10 @@ def _figure(scene: Scene, data: xarray.Dataset) -> Any:
         chosen = ""
         if "tone" in values.dims:
             values, error = (part.isel(tone=len(scene.tones) // 2) for part in (values, error))
-            chosen = f"tone {int(values.tone)}"
+            tone = int(values.tone)
+            chosen = f"tone {tone}"
+            if scene.lattices is not None:
+                chosen = f"source: band {tone}, {scene.lattices.bands(scene.n_bands).labels[tone - 1]}"
         label = plots.label_of(values)
         if name == "band_energy":
             plots.band_map(ax, times, values.values, title=chosen)
