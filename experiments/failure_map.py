@@ -140,7 +140,7 @@ def _symplectic(seed: int) -> list[Edge]:
 
     def growth(composition: symplectic.Composition, value: float) -> float:
         h = value / 2
-        trajectory = symplectic.march(chain, state, composition, h * (1 + 1e-9))(torch.tensor([h * STEPS]))
+        trajectory = symplectic.stepping(chain, state, composition, h * (1 + 1e-9))(torch.tensor([h * STEPS]))
         return float(trajectory.displacement.abs().max() / 0.01)
 
     def public(method: str, value: float) -> tc.Trajectory:

@@ -198,7 +198,7 @@ def test_step_beyond_the_damping_limit_is_refused():
         tc.evolve(chain, state, time_grid(1, 1), "verlet", step=0.101)
     assert str(raised.value).endswith("'verlet' with d_max = 20 at realization 2, got 0.101")
     tc.evolve(chain, state, time_grid(1, 1), "verlet", step=0.0999)
-    diverged = symplectic.march(chain, state, VERLET, 0.12)(time_grid(120, 1))
+    diverged = symplectic.stepping(chain, state, VERLET, 0.12)(time_grid(120, 1))
     assert diverged.displacement[1, -1].abs().max() > 1e6
 
 

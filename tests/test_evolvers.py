@@ -474,7 +474,7 @@ def test_edge_of_stability(name, composition, boundary):
     assert energy[..., 2].max() < 10 * energy[..., :2].max()
     with pytest.raises(FieldError, match="step must be less than"):
         tc.evolve(chain, state, times, name, step=1.01 * step)
-    outside = symplectic.march(chain, state, composition, 1.01 * step)(0.3 * times)
+    outside = symplectic.stepping(chain, state, composition, 1.01 * step)(0.3 * times)
     assert outside.displacement[..., 2, :].abs().max() > 1e6
 
 

@@ -139,7 +139,7 @@ def test_one_process_takes_up_what_others_left(size, method, tmp_path):
 @pytest.mark.parametrize("multiple", [1, 4, 5])
 @pytest.mark.parametrize("ranges", [[range(100)], [range(3, 20), range(40, 41), range(60, 100)], [range(99, 100)], []])
 def test_shares_hold_every_realization_once(size, multiple, ranges):
-    shares = [Ranks(rank, size).share(ranges, multiple) for rank in range(size)]
+    shares = [Ranks(rank, size).part(ranges, multiple) for rank in range(size)]
     assert joined(part for share in shares for part in share) == ranges
     starts = {part.start for part in ranges}
     for share in shares:

@@ -73,3 +73,23 @@ def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], workers:
     finally:
         pool.shutdown(wait=wait, cancel_futures=True)
         torch.set_num_threads(before)
+
+
+def ranges(count: int, workers: int) -> list[tuple[int, int]]:
+    """Rows 0 to count - 1 as a few ranges (begin, end) for each worker."""
+    size = -(-count // (4 * workers if workers > 1 else 1))
+    return [(begin, min(begin + size, count)) for begin in range(0, count, size)]
+
+
+def side_by_side(work: Callable[[int, int], None], count: int) -> None:
+    """Runs work(begin, end) over rows 0 to count - 1 side by side, on as many threads as torch uses.
+
+    For work without torch operations, whose number of threads is left alone: setting it, as
+    :func:`map_in_order` must, makes later small operations slow beside a busy process.
+    """
+    workers = min(torch.get_num_threads(), count)
+    if workers == 1:
+        work(0, count)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(lambda part: work(*part), ranges(count, workers)))

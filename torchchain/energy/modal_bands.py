@@ -51,9 +51,9 @@ def modal_band_energy(
     wave, momentum = _real_transform(modes.shapes), _real_transform(chain.masses[..., :, None] * modes.shapes)
     tone = _tones(chain.n_particles, wave.device)
     # Half of the energy at k and half at -k, which are one at k = 0 and at the last tone; the last column is the total.
-    share = torch.where((tone == 0) | (2 * tone == chain.n_particles), 0.5, 1.0).to(wave)
+    weight = torch.where((tone == 0) | (2 * tone == chain.n_particles), 0.5, 1.0).to(wave)
     band = torch.nn.functional.one_hot((tone - 1).clamp(min=0) // width, n_bands).to(wave) * (tone > 0)[:, None]
-    bins = share[:, None] * torch.cat([band, torch.ones_like(band[:, :1])], dim=1)
+    bins = weight[:, None] * torch.cat([band, torch.ones_like(band[:, :1])], dim=1)
     energy = (change_basis(speed, momentum) * change_basis(speed, wave)) @ bins
     shape = change_basis(position, wave)
     if chain.is_uniform_ring:

@@ -26,7 +26,7 @@ from torchchain.energy.bands import check_bands
 from torchchain.evolvers import start
 from torchchain.evolvers.chebyshev import CompiledAdvance
 from torchchain.evolvers.expansion import ROUNDING
-from torchchain.threads import map_in_order
+from torchchain.threads import map_in_order, ranges, side_by_side
 
 # Bytes of one field that a thread takes from the stencil through the transform at a time: what it holds stays in cache.
 _BLOCK = 2**18
@@ -80,9 +80,9 @@ def energy_moments(chain: Chain, state: State, times: Any, definition: str = "si
 
     kind = stencil.SITE_MOMENTS if definition == "site" else stencil.BOND_MOMENTS
     advance.check_work(times)
-    march, steps = stencil.March(advance.rows, mirrored=True, once=True), times.double().numpy()
+    rows_in_time, steps = stencil.Propagation(advance.rows, mirrored=True, once=True), times.double().numpy()
     out = np.empty((advance.rows.count, len(steps), 3))
-    stencil.share(lambda begin, end: march.moments(begin, end, steps, kind, out), advance.rows.count)
+    side_by_side(lambda begin, end: rows_in_time.moments(begin, end, steps, kind, out), advance.rows.count)
     moments = torch.from_numpy(out).to(state.displacement.dtype)
     total, center, width = moments.reshape(*shape, 3).unbind(-1)
     if not (out[..., 0] > 0).all():
@@ -140,7 +140,7 @@ def band_energy(
     window = min(len(steps), max(1, _BLOCK // (8 * n)))
     size = min(rows.count, max(1, _BLOCK // (8 * n * window)))
     strain = np.repeat(strain, 2)  # of the real and of the imaginary part
-    march = stencil.March(rows, mirrored=True, once=window == len(steps))
+    rows_in_time = stencil.Propagation(rows, mirrored=True, once=window == len(steps))
     bands, totals = np.empty((rows.count, len(steps), n_bands)), np.empty((rows.count, len(steps)))
 
     def work(part: tuple[int, int]) -> None:
@@ -153,13 +153,13 @@ def band_energy(
                 last = min(first + window, len(steps))
                 if fields.shape[1:3] != (high - low, last - first):
                     fields = torch.empty((count, high - low, last - first, n), dtype=torch.float64)
-                march.fields(low, high, steps[first:last], kind, fields.numpy(), low)
+                rows_in_time.fields(low, high, steps[first:last], kind, fields.numpy(), low)
                 spectra = torch.fft.rfft(fields).numpy().view(np.float64)
                 stencil.bin_spectra(spectra, kind, strain, normalize, low, first, bands, totals)
                 del spectra  # so that the next lie where these do, in cache
 
     workers = min(torch.get_num_threads(), rows.count)
-    for _ in map_in_order(work, stencil.ranges(rows.count, workers), workers):
+    for _ in map_in_order(work, ranges(rows.count, workers), workers):
         pass
     shape = (*state.displacement.shape[:-1], len(steps))
     if normalize and not (totals > 0).all():

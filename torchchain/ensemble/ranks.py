@@ -39,7 +39,7 @@ class Ranks:
             dist.broadcast_object_list(held, src=0, device=_HOST)
         return held[0]
 
-    def share(self, ranges: Sequence[range], multiple: int = 1) -> list[range]:
+    def part(self, ranges: Sequence[range], multiple: int = 1) -> list[range]:
         """This rank's part of the realizations: neighbors, whose moments merge to a few nodes.
 
         Args:
@@ -51,7 +51,7 @@ class Ranks:
         return [part for part in parts if len(part)]
 
     def _cut(self, ranges: Sequence[range], rank: int, multiple: int) -> int:
-        """The first realization of a rank's share."""
+        """The first realization of a rank's part."""
         left = sum(map(len, ranges)) * rank // self.size
         for part in ranges:
             if left < len(part):

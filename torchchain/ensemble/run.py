@@ -249,7 +249,7 @@ def ensemble_moments(
         plan, session, missing = begin
         run = prepared(scene, plan["method"], {**plan["options"], **(options or {})}, device)
         writer = checkpoint.writer(session, ranks.rank, identity, plan) if checkpoint is not None else None
-        own = ranks.share(missing, run.layout.group)
+        own = ranks.part(missing, run.layout.group)
         parts = _measured(
             run, lambda chunk: _moments_of(chunk, cut), own, memory_budget, progress and ranks.rank == 0, stages
         )

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 
 
 class Stages:
-    """Seconds spent in each named stage of a run; work on several threads counts its share of the time."""
+    """Seconds spent in each named stage of a run; work on several threads is weighted by one over their number."""
 
-    def __init__(self, share: float = 1.0) -> None:
-        self.share = share
+    def __init__(self, weight: float = 1.0) -> None:
+        self.weight = weight
         self.seconds: dict[str, float] = {}
 
     @contextmanager
@@ -20,7 +20,7 @@ class Stages:
         try:
             yield
         finally:
-            self.add({name: self.share * (time.perf_counter() - begin)})
+            self.add({name: self.weight * (time.perf_counter() - begin)})
 
     def add(self, seconds: dict[str, float]) -> None:
         """Take in the seconds of other stages."""

@@ -20,24 +20,7 @@ __all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "evolved", "r
 
 
 def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:
-    """States of the chain at the given times.
-
-    Args:
-        chain: masses (*batch, particle).
-        state: the start at time 0, (*batch, *any, particle).
-        times: (time,), in units of the travel time of sound over one particle; increasing, not negative.
-        method: a name in ``METHODS``; each entry states its order, stability, cost and limits.
-        options: the method's own.
-
-    Returns:
-        Trajectory with displacement and velocity (*batch, *any, time, particle).
-
-    Raises:
-        FieldError, FieldTypeError: for times, a method, an option or a chain that the method cannot treat.
-
-    Warns:
-        LinearityWarning: for linear contacts that the start would open (elongation 1, the initial overlap).
-    """
+    """``tc.evolve`` of chains alone; see :func:`torchchain.network.systems.evolve`."""
     return evolved(chain, state, times, method, options, stacklevel=4)
 
 

@@ -32,14 +32,14 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
-from torchchain.evolvers import kernels
 from torchchain.evolvers.expansion import LEAP, ROUNDING, SEGMENTS
 from torchchain.evolvers.method import Advance, Method
 from torchchain.modes import phase
 from torchchain.modes.localization import negative_pivots
+from torchchain.threads import side_by_side
 
 if TYPE_CHECKING:
-    from torchchain.evolvers.stencil import March, Rows
+    from torchchain.evolvers.stencil import Propagation, Rows
 
 SWEEPS = 8  # of the bound's power iteration: within 2 % of the highest frequency, or of 30 sweeps
 WASTE = 1e4  # a bound beyond so many times the chain's own is a mistake
@@ -142,13 +142,6 @@ def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
     return squared
 
 
-def kernels_compiled() -> bool:
-    """Whether the kernels need no compiling, in this process or from Numba's cache; the answer takes loading Numba."""
-    from torchchain.evolvers.stencil import march
-
-    return kernels.at_hand(march)
-
-
 def check_work(times: Tensor, frequency: float) -> None:
     """An error where W t asks for more stencils than anyone waits for; the rounding of W t is far from felt there."""
     end = times.detach().amax().item()
@@ -230,7 +223,7 @@ class CompiledAdvance:
         periodic = chain.is_free
         squared = np.empty(len(masses))
         if bound is None:
-            stencil.share(
+            side_by_side(
                 lambda begin, end: stencil.squared_bounds(begin, end, masses, springs, periodic, SWEEPS, squared),
                 len(masses),
             )
@@ -250,10 +243,10 @@ class CompiledAdvance:
         self._now = 0.0
 
     @cached_property
-    def _march(self) -> March:
+    def _propagation(self) -> Propagation:
         from torchchain.evolvers import stencil
 
-        return stencil.March(self.rows)
+        return stencil.Propagation(self.rows)
 
     def check_work(self, times: Tensor) -> None:
         """See :func:`check_work`."""
@@ -266,7 +259,9 @@ class CompiledAdvance:
         later = later_times(times, self._now)
         out = torch.empty((2, self.rows.count, len(later), self._n), dtype=self._dtype)
         steps, states = later.numpy(), out.numpy()
-        stencil.share(lambda begin, end: self._march.fields(begin, end, steps, stencil.STATES, states), self.rows.count)
+        side_by_side(
+            lambda begin, end: self._propagation.fields(begin, end, steps, stencil.STATES, states), self.rows.count
+        )
         self._now = later[-1].item()
         displacement, velocity = out.reshape(2, *self._shape, len(later), self._n)
         return Trajectory(times, displacement, velocity)

@@ -32,8 +32,8 @@ def check(chain: Chain, trajectory: Trajectory, initial: Tensor, allowed: Tensor
         energy = chain.energy(trajectory.displacement, trajectory.velocity)
         if trajectory.dissipated is not None:
             energy = energy + trajectory.dissipated
-        drift = (energy - initial[..., None]).abs()
-        bad = ~(drift <= (allowed * initial)[..., None])
+        change = (energy - initial[..., None]).abs()
+        bad = ~(change <= (allowed * initial)[..., None])
         if not bool(bad.any()):
             return
         where = tuple(int(i) for i in bad.nonzero()[0])

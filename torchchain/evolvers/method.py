@@ -14,6 +14,14 @@ Advance = Callable[[Tensor], Trajectory]
 """Called with consecutive windows of output times, returns the states at them."""
 
 
+def targets_of(times: Tensor, now: float) -> list[float]:
+    """The times of a window as numbers, none before ``now``, the end of the window before it."""
+    targets: list[float] = times.tolist()
+    if targets[0] < now:
+        raise checks.fail("times", f"continue from {now:g}, the end of the last window", targets[0])
+    return targets
+
+
 @dataclass(frozen=True)
 class Method:
     """One way to evolve a chain: what tests, charts, the plan, the memory estimate and the manual read.

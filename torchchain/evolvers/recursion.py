@@ -227,12 +227,12 @@ def advance(w, row, u, v, low, high, count, tables, mirror):
 def _quiet(w, row, u, v, used, stiff, p, limit):
     """Whether particle p has less of the squared energy norm than the limit in each of the states.
 
-    Its share is b v^2 plus u^2 times the stiffness of both contacts: what the chain would lose with it.
+    Its part is b v^2 plus u^2 times the stiffness of both contacts: what the chain would lose with it.
     """
     for j in range(used):
         x, y = w[u[j] + p], w[v[j] + p]
-        share = w[row.mass + p] * (y * y + stiff * (w[row.left + p] + w[row.right + p]) * x * x)
-        if share > limit or (share == 0.0 and (x != 0.0 or y != 0.0)):  # the square of 1e-170 is zero
+        part = w[row.mass + p] * (y * y + stiff * (w[row.left + p] + w[row.right + p]) * x * x)
+        if part > limit or (part == 0.0 and (x != 0.0 or y != 0.0)):  # the square of 1e-170 is zero
             return False
     return True
 

@@ -26,12 +26,9 @@ Importing this file imports Numba; :mod:`chebyshev` does it at the first use.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from torchchain.evolvers import kernels
 from torchchain.evolvers.coefficients import Tables, tabulate, top_order
@@ -52,8 +49,8 @@ from torchchain.evolvers.recursion import PAD, RING, Row, advance, aligned, clea
 from torchchain.evolvers.spectra import bin_spectra
 
 __all__ = [
-    "BOND_FIELDS", "BOND_MOMENTS", "SITE_FIELDS", "SITE_MOMENTS", "STATES", "UNIFORM_FIELDS", "March", "Rows",
-    "bin_spectra", "march", "ranges", "share", "squared_bounds",
+    "BOND_FIELDS", "BOND_MOMENTS", "SITE_FIELDS", "SITE_MOMENTS", "STATES", "UNIFORM_FIELDS", "Propagation", "Rows",
+    "bin_spectra", "propagate", "squared_bounds",
 ]  # fmt: skip
 
 # The mirrored form adds up rounding errors like a random walk's integral; a plain step now and then ends that.
@@ -71,7 +68,7 @@ def reverse(values, last):
 
 
 @kernel
-def march(
+def propagate(
     begin, end, masses, contacts, rigid_masses, frequencies, starts, periodic, times, tolerance, mirrored, kind,
     anchors, latest, clock, fields, moments, first,
 ):  # fmt: skip
@@ -228,7 +225,7 @@ def squared_bounds(begin, end, masses, contacts, periodic, sweeps, bounds):
 
     Args:
         begin, end: realizations.
-        masses, contacts, periodic: see :func:`march`.
+        masses, contacts, periodic: see :func:`propagate`.
         sweeps: of the bound's power iteration.
         bounds: (realization,), written.
     """
@@ -282,17 +279,17 @@ class Rows:
         return len(self.states)
 
 
-class March:
+class Propagation:
     """Rows on their way through time; each call takes some of them to the next window of times.
 
     Args:
         rows: chains and starts.
-        mirrored: see :func:`march`.
+        mirrored: see :func:`propagate`.
         once: there will be no second window, and nothing is kept for it.
     """
 
     def __init__(self, rows: Rows, mirrored: bool = False, once: bool = False) -> None:
-        kernels.announce(march)
+        kernels.announce(propagate)
         self.rows = rows
         self.mirrored = mirrored
         self.anchors = rows.states if once else rows.states.copy()
@@ -312,27 +309,7 @@ class March:
         self, begin: int, end: int, times: np.ndarray, kind: int, fields: np.ndarray, moments: np.ndarray, first: int
     ) -> None:
         rows = self.rows
-        march(
+        propagate(
             begin, end, rows.masses, rows.contacts, rows.rigid_masses, rows.frequencies, rows.starts, rows.periodic, times,
             rows.tolerance, self.mirrored, kind, self.anchors, self.latest, self.clock, fields, moments, first,
         )  # fmt: skip
-
-
-def ranges(count: int, workers: int) -> list[tuple[int, int]]:
-    """Rows 0 to count - 1 as a few ranges (begin, end) for each worker."""
-    size = -(-count // (4 * workers if workers > 1 else 1))
-    return [(begin, min(begin + size, count)) for begin in range(0, count, size)]
-
-
-def share(work: Callable[[int, int], None], count: int) -> None:
-    """Runs work(begin, end) over rows 0 to count - 1 side by side, on as many threads as torch uses.
-
-    For work without torch operations, whose number of threads is left alone: setting it, as
-    :func:`torchchain.threads.map_in_order` must, makes later small operations slow beside a busy process.
-    """
-    workers = min(torch.get_num_threads(), count)
-    if workers == 1:
-        work(0, count)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(lambda part: work(*part), ranges(count, workers)))

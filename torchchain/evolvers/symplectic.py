@@ -23,7 +23,7 @@ from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.evolvers import energy_guard
-from torchchain.evolvers.method import Advance
+from torchchain.evolvers.method import Advance, targets_of
 
 Pair = tuple[float, float]
 
@@ -147,11 +147,11 @@ def substeps(now: float, times: list[float], step: Tensor | float) -> np.ndarray
 def start(chain: Chain, state: State, composition: Composition, method: str, step: float | None) -> Advance:
     """The evolution by a composition, its step checked."""
     steps = checked_step(chain, state, composition, method, step)
-    advance = march(chain, state, composition, steps)
+    advance = stepping(chain, state, composition, steps)
     if chain.contact == "linear":
         return advance
     initial = chain.energy(state.displacement, state.velocity).detach()
-    # A stable step lets the energy of a mode swing by (w h)^2 / 4 over 1 minus that in Verlet's case; more is a drift.
+    # A stable step lets the energy of a mode swing by (w h)^2 / 4 over 1 minus that in Verlet's case; more is a loss or gain that goes on.
     ratio = steps * highest_frequency(chain, initial_overlap(chain, state)) / composition.limit
     allowed = torch.where(ratio < 1, 0.1 + ratio**2 / (1 - ratio**2), 0.1)
     remedy = f"method '{method}' with step {steps.amax().item():.4g}: use a smaller step"
@@ -164,7 +164,7 @@ def start(chain: Chain, state: State, composition: Composition, method: str, ste
     return guarded
 
 
-def march(chain: Chain, state: State, composition: Composition, step: Tensor | float) -> Advance:
+def stepping(chain: Chain, state: State, composition: Composition, step: Tensor | float) -> Advance:
     """The evolution by a composition with steps of at most ``step``, a number or one per state (*batch, *any).
 
     Nothing here checks them for stability.
@@ -211,7 +211,7 @@ def _tensors(chain: Chain, state: State, composition: Composition, step: Tensor 
 
     def advance(times: Tensor) -> Trajectory:
         nonlocal now, peak
-        targets, outputs = _targets(times, now), []
+        targets, outputs = targets_of(times, now), []
         counts = torch.from_numpy(substeps(now, targets, step)).to(step.device)
         for target, count in zip(targets, counts.unbind(-1), strict=True):
             length = (target - now) / count.clamp(min=1).to(torch.float64)
@@ -263,10 +263,10 @@ def _rows(chain: Chain, state: State, composition: Composition, step: Tensor | f
         peak = torch.full((len(displacement), n + 1), -math.inf, dtype=dtype)
         lost = torch.zeros(len(displacement), dtype=dtype)
         weight = (1 / chain.masses).reshape(-1, n).contiguous()
-        contacts = [chain.contact_stiffness, chain.contact_damping]
-        if periodic:
-            contacts = [torch.cat([values, values[..., :1]], dim=-1) for values in contacts]
-        stiffness, damping = (values.reshape(-1, n + 1).contiguous() for values in contacts)
+        stiffness, damping = (
+            chain.in_a_row(values).reshape(-1, n + 1).contiguous()
+            for values in (chain.contact_stiffness, chain.contact_damping)
+        )
         opening, closing = (torch.tensor(pair, dtype=dtype) for pair in (composition.opening, composition.closing))
         middle = torch.tensor(composition.middle, dtype=dtype).reshape(-1, 2)
         longest = torch.as_tensor(step, dtype=torch.float64).expand(lead).reshape(-1)
@@ -274,7 +274,7 @@ def _rows(chain: Chain, state: State, composition: Composition, step: Tensor | f
 
     def advance(times: Tensor) -> Trajectory:
         nonlocal now
-        targets = _targets(times, now)
+        targets = targets_of(times, now)
         counts = substeps(now, targets, longest)
         steps = torch.from_numpy(np.diff(targets, prepend=now) / np.maximum(counts, 1)).to(dtype)
         rows, window = len(displacement), len(targets)
@@ -307,11 +307,3 @@ def _rows(chain: Chain, state: State, composition: Composition, step: Tensor | f
         )
 
     return advance
-
-
-def _targets(times: Tensor, now: float) -> list[float]:
-    """The times as numbers; a window that starts before the last one ended is an error."""
-    targets: list[float] = times.tolist()
-    if targets[0] < now:
-        raise checks.fail("times", f"continue from {now:g}, the end of the last window", targets[0])
-    return targets
