@@ -148,7 +148,9 @@ class MasterEquation(Printed, nn.Module):
                 f"{selection.held_out_distance:.4f}, of two halves {selection.halves_distance:.4f}"
             )
         if self.starts is not None:
-            rows["starts"] = f"any on {self.starts.n_particles} particles: {self.starts.n_parameters} fitted numbers more"
+            rows["starts"] = (
+                f"any on {self.starts.n_particles} particles: {self.starts.n_parameters} fitted numbers more"
+            )
         if bool(self.damping.any()):
             rows["damping"] = f"{float(self.damping.min()):.3g} to {float(self.damping.max()):.3g} per unit time"
         if self.calibration.report.certificate is not None:

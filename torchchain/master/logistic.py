@@ -109,7 +109,10 @@ class Regression:
         return table
 
 
-def solve(regressions: Sequence[Any], mixing: np.ndarray, start: np.ndarray | None = None, progress: Any = None) -> tuple[np.ndarray, dict[str, Any]]:  # fmt: skip
+def solve(
+    regressions: Sequence[Any], mixing: np.ndarray, start: np.ndarray | None = None, progress: Any = None,
+    stiffness: np.ndarray | None = None,
+) -> tuple[np.ndarray, dict[str, Any]]:  # fmt: skip
     """Levenberg's and Marquardt's method for several regressions whose coefficients are mixtures of common ones.
 
     Args:
@@ -117,22 +120,25 @@ def solve(regressions: Sequence[Any], mixing: np.ndarray, start: np.ndarray | No
         mixing: weight of each of the common sets of coefficients in each regression, (regression, set).
         start: (set, coefficient); zero if None.
         progress: called with 1 after each step.
+        stiffness: against each of the sets, (set,), beside the ridge; none if None.
 
     Returns:
         (set, coefficient), and a report: converged, steps, misfit in units of the error.
     """
     sets, size = mixing.shape[1], int(regressions[0].held.sum())
     found = np.zeros((sets, size)) if start is None else start.copy()
+    stiff = (np.zeros(sets) if stiffness is None else stiffness)[:, None]
 
     def misfits(found: np.ndarray) -> tuple[float, list[np.ndarray]]:
         each = [r.misfit(r.table(c)) for r, c in zip(regressions, mixing @ found, strict=True)]
-        return sum(value for value, _ in each), [predicted for _, predicted in each]
+        bent = float((stiff * found**2).sum())
+        return bent + sum(value for value, _ in each), [predicted for _, predicted in each]
 
     now, predicted = misfits(found)
     damping, converged, steps = 1.0, False, 0
     while steps < STEPS:
         steps += 1
-        square, pull = _joint(regressions, mixing, found, predicted)
+        square, pull = _joint(regressions, mixing, found, predicted, stiff)
         diagonal = square.diagonal().copy()
         better = math.inf
         while damping < 1e12:
@@ -157,7 +163,11 @@ def solve(regressions: Sequence[Any], mixing: np.ndarray, start: np.ndarray | No
 
 
 def _joint(
-    regressions: Sequence[Regression], mixing: np.ndarray, found: np.ndarray, predicted: Sequence[np.ndarray]
+    regressions: Sequence[Regression],
+    mixing: np.ndarray,
+    found: np.ndarray,
+    predicted: Sequence[np.ndarray],
+    stiff: Any,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Matrix and right-hand side, (set, coefficient), of the linearized problem of all regressions."""
     sets, size = found.shape
@@ -166,12 +176,15 @@ def _joint(
         part, force = r.normal(p, r.table(c))
         matrix += m[:, None, None, None] * m[None, None, :, None] * part[None, :, None, :]
         pull += np.outer(m, force)
-    return matrix.reshape(sets * size, -1), pull
+    square = matrix.reshape(sets * size, -1)
+    square.flat[:: len(square) + 1] += np.broadcast_to(stiff, found.shape).ravel()
+    return square, pull - stiff * found
 
 
 def stepped(
-    regressions: Sequence[Regression], mixing: np.ndarray, found: np.ndarray, drawn: Sequence[np.ndarray]
-) -> np.ndarray:
+    regressions: Sequence[Regression], mixing: np.ndarray, found: np.ndarray, drawn: Sequence[np.ndarray],
+    stiffness: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Coefficients for other data like the regressions', by one step of Gauss and Newton each, for error bars.
 
     Args:
@@ -183,7 +196,8 @@ def stepped(
         (replica, set, coefficient).
     """
     predicted = [r.predicted(r.table(c)) for r, c in zip(regressions, mixing @ found, strict=True)]
-    square, rest = _joint(regressions, mixing, found, predicted)
+    stiff = (np.zeros(len(found)) if stiffness is None else stiffness)[:, None]
+    square, rest = _joint(regressions, mixing, found, predicted, stiff)
     pulls = np.repeat(rest[None], len(drawn[0]), axis=0)
     for r, p, m, data in zip(regressions, predicted, mixing, drawn, strict=True):
         force = np.zeros((len(data), *r.held.shape))

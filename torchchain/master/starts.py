@@ -116,7 +116,9 @@ class StartModel(nn.Module):
 
     @property
     def _tones(self) -> Tones:
-        return Tones(**{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling")}, n_bands=self.n_bands)
+        return Tones(
+            **{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling")}, n_bands=self.n_bands
+        )
 
     def transfer(self, kind: str, tones: Any, times: Tensor) -> Tensor:
         """T [tone, time, receiver] of some tones, counted from 1.
@@ -189,7 +191,9 @@ class StartModel(nn.Module):
     def check(self, start: StartEnergy) -> None:
         """An error for a start on rings of another length."""
         if start.n_particles != self.n_particles:
-            raise checks.fail("initial", f"be a start on {self.n_particles} particles, as calibrated", start.n_particles)
+            raise checks.fail(
+                "initial", f"be a start on {self.n_particles} particles, as calibrated", start.n_particles
+            )
 
 
 def can_fit(transfer: BandTransfer) -> bool:

@@ -98,7 +98,8 @@ class Tones:
         rate = self.decay[numbers][:, None] + self.decay
         weight = (torch.arange(len(self), device=gap.device) != numbers[:, None]) / (gap**2 + rate**2)
         far, total = (
-            x.reshape(len(numbers), self.n_bands, self.width).sum(-1) for x in (torch.asinh(gap / rate) * weight, weight)
+            x.reshape(len(numbers), self.n_bands, self.width).sum(-1)
+            for x in (torch.asinh(gap / rate) * weight, weight)
         )
         return far / total.clamp(min=1e-300)
 
@@ -119,7 +120,9 @@ def shares(
     """T (source, time, band) of some sources: odds over their sum, never negative."""
     index = torch.from_numpy(held(degrees)).to(coefficients.device)
     table = coefficients.new_zeros(index.shape).masked_scatter(index, coefficients)
-    exponent = torch.einsum("srp,pt->str", tones.shapes(numbers, degrees), table @ polynomials(clock_of(times), degrees[2]).T)
+    exponent = torch.einsum(
+        "srp,pt->str", tones.shapes(numbers, degrees), table @ polynomials(clock_of(times), degrees[2]).T
+    )
     moved = exponent.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).exp()
     moved = torch.cat([tones.odds(kind, numbers, times) * moved[..., :-1], moved[..., -1:]], -1)
     moved = moved / moved.sum(-1, keepdim=True)
@@ -137,7 +140,14 @@ class ToneRegression:
     """
 
     def __init__(
-        self, tones: Tones, kind: str, degrees: Sequence[int], numbers: Tensor, times: Tensor, data: Tensor, weight: Tensor
+        self,
+        tones: Tones,
+        kind: str,
+        degrees: Sequence[int],
+        numbers: Tensor,
+        times: Tensor,
+        data: Tensor,
+        weight: Tensor,
     ) -> None:
         odds = tones.odds(kind, numbers, times)
         self.odds = torch.cat([odds, torch.ones_like(odds[..., :1])], -1).numpy()
