@@ -13,6 +13,7 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer, with_late_average
 from torchchain.master.certified import certified
 from torchchain.master.compact import CompactModel
+from torchchain.master.derived import TheoryModel
 from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import FitWarning, checked_window, within
 from torchchain.master.ladder import MODELS, fitted_by, methods
@@ -159,7 +160,7 @@ def calibrate(
             fitted, told, proof = certified(transfer, asked, (fitted, told), report.selection is not None, shown.update)
         report = replace(
             report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=count,
-            certificate=fitted.certificate if isinstance(fitted, CompactModel) else proof,
+            certificate=fitted.certificate if isinstance(fitted, CompactModel | TheoryModel) else proof,
         )  # fmt: skip
         _check_growth(fitted, asked)
         if count:

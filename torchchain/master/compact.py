@@ -212,8 +212,8 @@ class CompactModel(TransferModel):
         odds = first_odds(self.waves, times, sources)
         clock = polynomials(clock_of(times), self.degrees_[2])
         p, q = terms(self.degrees_)
-        moved = odds * _power(self._place[sources], clock, self.coefficients[: len(p)], p)
-        own = _power(self._own[sources], clock, self.coefficients[len(p) :], q)[:, :, 0]
+        moved = odds * power(self._place[sources], clock, self.coefficients[: len(p)], p)
+        own = power(self._own[sources], clock, self.coefficients[len(p) :], q)[:, :, 0]
         mask = torch.nn.functional.one_hot(sources, self.n_bands).to(moved)[:, None]
         moved = moved * (1 - mask) + own[:, :, None] * mask
         return moved / moved.sum(-1, keepdim=True)
@@ -244,26 +244,31 @@ class CompactModel(TransferModel):
         Raises:
             CertificateError: if there is none of any order.
         """
-        times = torch.cat([
-            torch.linspace(0.25, 5, 20, dtype=torch.float64), torch.logspace(math.log10(5.3), math.log10(span), 90, dtype=torch.float64),
-        ])  # fmt: skip
-        own = self if self._rates.dtype == torch.float64 else copy.deepcopy(self).double()
-        with torch.no_grad():
-            mean, basis = own._moved(times), own.basis
-        order = checked_order(order, len(times))
-        for smaller in (order, *(known for known in ORDERS[::-1] if sum(known) < sum(order))):
-            model = MemoryModel(rates=own.rates, **fit_memory(times, mean, basis, smaller)[0])
-            if self.loss.numel():  # what decays to nothing has no long-time energy to stay above of
-                return model
-            try:
-                return nonnegative(model, times, mean)[0]
-            except CertificateError as error:
-                reason = error
-        raise reason
+        return nearest_memory(self, order, span, bool(self.loss.numel()))
 
     def embedding(self) -> Embedding:
         """That of the nearest model with memory (:meth:`as_memory`): these odds obey no linear equation of their own."""
         return self.as_memory().embedding()
+
+
+def nearest_memory(model: TransferModel, order: tuple[int, int], span: float, damped: bool) -> MemoryModel:
+    """The model with memory that is nearest to one without a linear equation: see ``CompactModel.as_memory``."""
+    times = torch.cat([
+        torch.linspace(0.25, 5, 20, dtype=torch.float64), torch.logspace(math.log10(5.3), math.log10(span), 90, dtype=torch.float64),
+    ])  # fmt: skip
+    own = model if model.basis.dtype == torch.float64 else copy.deepcopy(model).double()
+    with torch.no_grad():
+        mean, basis = own.transfer(times), own.basis
+    order = checked_order(order, len(times))
+    for smaller in (order, *(known for known in ORDERS[::-1] if sum(known) < sum(order))):
+        found = MemoryModel(rates=own.rates, **fit_memory(times, mean, basis, smaller)[0])
+        if damped:  # what decays to nothing has no long-time energy to stay above of
+            return found
+        try:
+            return nonnegative(found, times, mean)[0]
+        except CertificateError as error:
+            reason = error
+    raise reason
 
 
 def clock_of(times: Tensor) -> Tensor:
@@ -299,7 +304,7 @@ def shapes(waves: Waves, degrees: tuple[int, int, int]) -> tuple[Tensor, Tensor]
     return first, own[:, None]
 
 
-def _power(shape: Tensor, clock: Tensor, coefficients: Tensor, index: list[Any]) -> Tensor:
+def power(shape: Tensor, clock: Tensor, coefficients: Tensor, index: list[Any]) -> Tensor:
     """exp of the polynomials, [source, time, receiver], from shapes [source, receiver, term] and clock [time, degree]."""
     heads = list(dict.fromkeys(entry[:-1] for entry in index))
     place = {head: i for i, head in enumerate(heads)}

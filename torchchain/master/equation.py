@@ -21,6 +21,7 @@ from torchchain.ensemble.scene import Scene, describe
 from torchchain.master import file
 from torchchain.master.certificate import certify
 from torchchain.master.compact import CompactModel
+from torchchain.master.derived import TheoryModel
 from torchchain.master.fits import AnalyticReport
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
@@ -356,7 +357,7 @@ class MasterEquation(Printed, nn.Module):
         Raises:
             FieldError: for a number of bands that does not divide the present one, or a model without memory.
         """
-        own = self.model.as_memory() if isinstance(self.model, CompactModel) else self.model
+        own = self.model.as_memory() if isinstance(self.model, CompactModel | TheoryModel) else self.model
         if not isinstance(own, MemoryModel):
             raise checks.fail("model", "be 'memory' to be coarsened", repr(self.calibration.model))
         n_bands = checks.integer("n_bands", n_bands, 1, self.n_bands)

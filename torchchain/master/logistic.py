@@ -57,7 +57,16 @@ class Regression:
         n = len(waves.source_frequency)
         eye = torch.eye(n, dtype=torch.float64)
         odds = first_odds(waves, times, torch.arange(n)) * (1 - eye[:, None]) + eye[:, None]
-        first, own = shapes(waves, degrees)
+        return cls.of_odds(odds, shapes(waves, degrees), degrees, times, data, weight)
+
+    @classmethod
+    def of_odds(
+        cls, odds: Tensor, parts: tuple[Tensor, Tensor], degrees: tuple[int, int, int], times: Tensor, data: Tensor,
+        weight: np.ndarray,
+    ) -> Regression:  # fmt: skip
+        """From first odds [source, time, receiver] and the polynomials of pairs and of the own band, as of ``shapes``."""
+        first, own = parts
+        eye = torch.eye(len(odds), dtype=torch.float64)
         shape = torch.cat([first * (1 - eye)[..., None], own * eye[..., None]], dim=-1)
         held = np.zeros((shape.shape[-1], degrees[2] + 1), dtype=bool)
         row = 0
@@ -226,11 +235,22 @@ def regression(
     waves: Waves, degrees: tuple[int, int, int], times: Tensor, mean: Tensor, long_time: Tensor | None = None,
     distance: Tensor | None = None, left: Tensor | None = None,
 ) -> Regression:  # fmt: skip
-    """The regression of an ensemble's transfer at some of its times, and at infinity if that is known.
+    """The regression of an ensemble's transfer at its :func:`fit_points`.
 
     Args:
         waves: of the scene.
         degrees: of the polynomials.
+        times, mean, long_time, distance, left: see :func:`fit_points`.
+    """
+    return Regression.of(waves, degrees, *fit_points(times, mean, long_time, distance, left))
+
+
+def fit_points(
+    times: Tensor, mean: Tensor, long_time: Tensor | None = None, distance: Tensor | None = None, left: Tensor | None = None
+) -> tuple[Tensor, Tensor, np.ndarray]:
+    """What a regression is held to: some of the times, and infinity if it is known; the transfer there; its weights.
+
+    Args:
         times, mean, long_time: (time,), [source, time, receiver], [source, receiver].
         distance: expected total variation of two ensembles at each time, (time,); None to count errors relative to how far
             energy has moved.
@@ -256,7 +276,7 @@ def regression(
     weight = len(mean) / math.sqrt(math.pi) / spread.numpy()
     if left is not None:
         weight = weight * left[:, picked].numpy()
-    return Regression.of(waves, degrees, times, data, weight)
+    return times, data, weight
 
 
 def fit_compact(

@@ -87,6 +87,7 @@ class ReducedModel:
         rungs: settings of ``climbed_by`` that selection tries, from the fewest fitted numbers up.
         check_scene: raises a FieldError for chains, or data without a scene (None), that it cannot describe.
         windows: ends of windows of time, in each of which selection holds it to the ensemble's error; none: on average.
+        near: distance from fresh chains over that of two ensembles, up to which it will do in each window.
         never_negative: whether its energies are never negative by its form. Of damped chains, whose energies no
             certificate covers, selection tries no other model where such a one describes them.
         replicas: ``replicas(transfer, recipe, model, repeats)`` -> the models of ensembles in which the blocks are
@@ -113,6 +114,7 @@ class ReducedModel:
     rungs: Callable[[int], Sequence[Any]] = lambda n_times: (NoSettings(),)
     check_scene: Callable[[Scene | None], None] = lambda scene: None
     windows: tuple[float, ...] = ()
+    near: float = 1.25
     never_negative: bool = False
     replicas: Callable[[BandTransfer, Recipe, Any, Tensor], Iterator[TransferModel]] | None = None
 

@@ -20,8 +20,6 @@ from torchchain.master.sample import Sample, decade_weights, exact_basis
 
 ENOUGH = 1.05
 """Distance of a model that is as good as the ensemble, over that of two halves, which is itself uncertain by some per cent."""
-NEAR = 1.25
-"""Distance from fresh chains over that of two ensembles, up to which a model of fewer numbers will do in a window of time."""
 
 
 def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
@@ -53,7 +51,7 @@ def select(
     """The first rung that, fitted on every other block, predicts the rest as well as the fitted blocks' means do.
 
     As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time is taken if,
-    fitted to all blocks, it is foreseen to be within NEAR times the noise in every one. If none is, the nearest is
+    fitted to all blocks, it is foreseen to be within ``near`` times the noise in every one. If none is, the nearest is
     taken. Models with rates are tried with procedure L.
 
     Returns:
@@ -94,12 +92,12 @@ def select(
         models.append(model)
         if not record.windows:
             enough = tried[-1].distance <= ENOUGH * noise
-        elif foreseen(halves, missed, halves) @ weight <= NEAR:  # not sure to be too far off
+        elif foreseen(halves, missed, halves) @ weight <= record.near:  # not sure to be too far off
             _, other = fitted(candidate, parts[1], model)
             back = total_variation(other, parts[0].mean).mean(0)
             both, spread = (missed + back) / 2, total_variation(found, other).mean(0)
             enough = all(
-                float(foreseen(*(part[window].mean() for part in (halves, both, spread)))) <= NEAR
+                float(foreseen(*(part[window].mean() for part in (halves, both, spread)))) <= record.near
                 for window in windows(transfer.times, record.windows)
             )
         if enough:

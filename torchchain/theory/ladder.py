@@ -18,6 +18,7 @@ so a pair of frequencies costs one product for every source and receiving band, 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -56,6 +57,15 @@ class Waves:
     source_bands: Tensor
     momentum: bool = False
     damping: float = 0.0
+
+    @classmethod
+    def of_tones(
+        cls, n_particles: int, n_bands: int, tones: Sequence[int], momentum: bool = False, damping: float = 0.0
+    ) -> Waves:
+        """The waves of sources that are tones, counted from 1."""
+        number = torch.tensor(tones)
+        squares = 4 * torch.sin(math.pi / n_particles * number.double()).square()
+        return cls(n_particles, n_bands, squares, (number - 1) // (n_particles // 2 // n_bands), momentum, damping)
 
     @property
     def ring(self) -> int | Levels:

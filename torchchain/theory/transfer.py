@@ -19,6 +19,9 @@ from torchchain.theory.localized import MEASURED, Frequencies, Return, interfere
 from torchchain.threads import single_thread
 
 LATEST_TIME = 5000.0
+"""Of damped chains, whose frequencies die out one after the other."""
+FADING = 800.0
+"""From here on what the ladder has not yet spread fades exponentially: each frequency has one rate, of leaving the tone."""
 _MOST_TONES = 1024  # of the ring on which interference is added up: beyond it bands are wide against its features
 _SHAPE_ERROR = 0.2  # part of the interference that its universal shape misses, measured
 _ONSET_ERROR = 0.6  # part of a factor of two in its time of onset, likewise
@@ -75,7 +78,8 @@ def theory_transfer(
             take the place of masses and tensions that of displacements.
         n_particles: N, even.
         n_bands: B.
-        times: (time,), up to 5000; the ladder beyond 400 is averaged over some 10 units of time around each.
+        times: (time,); of damped chains up to 5000. The ladder beyond 400 is averaged over some 10 units of time around
+            each, and beyond 800 what it has not yet spread fades as it did from 400 to 800.
         tones: one or more sources, counted from 1; None for the center tone of every band.
         boundary: "periodic"; plane waves are no modes of the mean fixed chain.
         stiffness_disorder: of the contacts; with equal masses alone.
@@ -98,24 +102,38 @@ def theory_transfer(
         torch.Size([8, 3, 8])
     """
     times = checks.times("times", times).to(torch.float64)
-    law, waves, k = _checked(
-        disorder, n_particles, n_bands, tones, boundary, stiffness_disorder, contact, damping, times
+    law, waves = described(
+        disorder, n_particles, n_bands, tones, boundary, stiffness_disorder, contact, damping, float(times[-1])
     )
     checks.truth("localization", localization)
+    return transfer_of_law(law, waves, times, localization, numbers, decay)
+
+
+def transfer_of_law(
+    law: Law, waves: Waves, times: Tensor, localization: bool = True, numbers: Return = MEASURED, decay: float = DECAY
+) -> TheoryTransfer:
+    """:func:`theory_transfer` of what :func:`described` made of its arguments; times (time,), to 5000."""
+    n_bands, damping = waves.n_bands, waves.damping
+    k = 2 * torch.asin(waves.sources.sqrt() / 2)
     with single_thread(), torch.no_grad():
         edges = spectrum_edges(law)
-        mean = ladder_transfer(law, waves, times, edges, decay)
-        total = mean.sum(-1)
+        late = (times > FADING) & (damping == 0)
+        asked = torch.cat([times[~late], times.new_tensor([FADING / 2, FADING])]).unique() if bool(late.any()) else times
+        ladder = ladder_transfer(law, waves, asked, edges, decay)
+        total = ladder.sum(-1)
         closure = 0.0
         if damping == 0:
             closure = float((total - 1).abs().max())
-            mean = mean / total[..., None]
+            ladder = ladder / total[..., None]
+        mean = ladder[:, torch.searchsorted(asked, times.clamp(max=float(asked[-1])))]
         long_time = torch.zeros(len(k), n_bands, dtype=torch.float64)
         long_error = torch.zeros(len(k), dtype=torch.float64)
         error = torch.zeros(len(k), len(times), dtype=torch.float64)
         ring = _coarser(waves)
         for s, (spectrum, wave) in enumerate(zip(source_frequencies(law, ring, edges[0]), k.tolist(), strict=True)):
             plain, pattern = _patterns(ring, wave, spectrum, numbers)
+            if bool(late.any()):
+                mean[s, late] = _faded(ladder[s, torch.searchsorted(asked, asked[-1] / asked.new_tensor([2.0, 1.0]))], plain, times[late])
             came = onset(times, spectrum, numbers)
             earlier = onset(2 * times, spectrum, numbers)
             left = torch.exp(-damping * spectrum.nodes.square()[:, None] * times)
@@ -134,9 +152,17 @@ def theory_transfer(
     settings = {
         "edge": edges[0],
         "closure": closure,
-        "stretches": stretches(float(times[-1]), edges, decay, waves.momentum),
+        "stretches": stretches(float(asked[-1]), edges, decay, waves.momentum),
     }
     return TheoryTransfer(times, mean, long_time, error, long_error, settings)
+
+
+def _faded(ladder: Tensor, settled: Tensor, times: Tensor) -> Tensor:
+    """Energies (time, band) after FADING, from those at half of it and at it, (2, band), which go to ``settled``."""
+    rest = ladder - settled
+    half, last = rest.abs().sum(-1).clamp(min=1e-12).tolist()
+    rate = max(0.0, math.log(half / last)) / (FADING / 2)
+    return settled + rest[1] * torch.exp(-rate * (times - FADING))[:, None]
 
 
 def _distance(change: Tensor) -> Tensor:
@@ -158,7 +184,7 @@ def _coarser(waves: Waves) -> Waves:
     return Waves(n, waves.n_bands, waves.sources, waves.source_bands, waves.momentum, waves.damping)
 
 
-def _checked(
+def described(
     disorder: Disorder,
     n_particles: int,
     n_bands: int,
@@ -167,9 +193,9 @@ def _checked(
     stiffness_disorder: Disorder | None,
     contact: str,
     damping: float,
-    times: Tensor,
-) -> tuple[Law, Waves, Tensor]:
-    """The law, the waves and the wavenumbers of the sources; an error for what the theory does not hold for."""
+    last: float = 0.0,
+) -> tuple[Law, Waves]:
+    """The law and the waves, with times up to ``last``; an error for what the theory does not hold for."""
     checks.instance("disorder", disorder, Disorder)
     checks.instance("stiffness_disorder", stiffness_disorder, Disorder, type(None))
     n_particles = checks.integer("n_particles", n_particles, 4)
@@ -181,8 +207,8 @@ def _checked(
         raise checks.fail("boundary", "be 'periodic' for method 'theory', whose waves are a ring's", repr(boundary))
     if contact != "linear":
         raise checks.fail("contact", "be 'linear' for method 'theory'", repr(contact))
-    if float(times[-1]) > LATEST_TIME:
-        raise checks.fail("times", f"be at most {LATEST_TIME:g} for method 'theory' (see long_time)", float(times[-1]))
+    if last > LATEST_TIME and damping > 0:
+        raise checks.fail("times", f"be at most {LATEST_TIME:g} for method 'theory' of damped chains", last)
     soft = stiffness_disorder is not None and stiffness_disorder.strength > 0
     if soft and disorder.strength > 0:
         raise checks.fail("stiffness_disorder", "be without mass disorder for method 'theory'", stiffness_disorder)
@@ -193,9 +219,5 @@ def _checked(
         raise checks.fail("tones", "hold at least one tone", "none")
     for tone in found:
         checks.integer("tones", tone, 1, n_particles // 2)
-    number = torch.tensor(found, dtype=torch.float64)
-    k = 2 * math.pi / n_particles * number
-    width = n_particles // 2 // n_bands
-    bands = (torch.tensor(found) - 1) // width
     law = law_of(stiffness_disorder).inverse() if soft and stiffness_disorder is not None else law_of(disorder)
-    return law, Waves(n_particles, n_bands, 4 * torch.sin(k / 2).square(), bands, soft, damping), k
+    return law, Waves.of_tones(n_particles, n_bands, found, soft, damping)

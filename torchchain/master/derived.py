@@ -1,0 +1,387 @@
+"""Models that the theory of disorder derives: without a fitted number, and with a few that mend what it misses.
+
+The transfer T0 of :mod:`torchchain.theory` is computed from the law of the masses wherever the model is asked. Where it is
+to be mended, its entries are odds, as in :mod:`torchchain.master.compact`, which polynomials of place, distance and time
+multiply:
+
+    T[s, r](t) = o_sr / sum_r' o_sr',   o_sr = T0[s, r](t) exp(p(u, v, tau)),   o_ss = T0[s, s](t) exp(q(u, tau)).
+
+For any coefficients nothing is negative, rows add up to 1, T(0) = I, and without coefficients T = T0.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchchain import checks
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.compact import (
+    checked_degrees,
+    clock_of,
+    n_coefficients,
+    nearest_memory,
+    polynomials,
+    power,
+    terms,
+)
+from torchchain.master.fits import linear_weights
+from torchchain.master.compact_record import CompactReport, drawn_again
+from torchchain.master.logistic import Regression, fit_points, solve, stepped
+from torchchain.master.memory import MemoryModel
+from torchchain.master.model import Embedding, TransferModel
+from torchchain.master.proof import Certificate
+from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
+from torchchain.master.sample import Sample
+from torchchain.theory.ladder import Waves
+from torchchain.theory.law import Law
+from torchchain.theory.transfer import TheoryTransfer, described, transfer_of_law
+from torchchain.threads import single_blas_thread
+
+LADDER = ((1, 1, 2), (2, 2, 4), (3, 3, 6), (4, 4, 8))
+"""Degrees in place, distance and time that are tried one after the other."""
+NEAREST = 1.0
+"""Distance from fresh chains over that of two ensembles, up to which it will do: as near as another ensemble would be."""
+SOFT = 1e-3
+"""Energies of a band below this share of its mean are taken up smoothly, so that none is negative: an ensemble's mean of
+definition "site" may be, by some 1e-4."""
+RATE_TIMES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+FIRST_ROOM = 0.02
+"""Distances in wavenumber are counted in units of the width of a line, or of this."""
+
+
+@dataclass(frozen=True)
+class Ring:
+    """What the theory wants to know of chains, in numbers that can be compared.
+
+    Attributes:
+        values, weights: of the law, see :class:`torchchain.theory.Law`.
+        n_particles, n_bands, tones: of the ring and its sources.
+        dual: whether the law is that of the compliances, with equal masses.
+        damping: of the contacts.
+    """
+
+    values: tuple[float, ...]
+    weights: tuple[float, ...]
+    n_particles: int
+    n_bands: int
+    tones: tuple[int, ...]
+    dual: bool
+    damping: float
+
+
+@functools.lru_cache(maxsize=8)
+def _derived(ring: Ring, times: tuple[float, ...]) -> TheoryTransfer:
+    law = Law(torch.tensor(ring.values, dtype=torch.float64), torch.tensor(ring.weights, dtype=torch.float64))
+    waves = Waves.of_tones(ring.n_particles, ring.n_bands, ring.tones, ring.dual, ring.damping)
+    return transfer_of_law(law, waves, torch.tensor(times, dtype=torch.float64))
+
+
+def derived(ring: Ring, times: Tensor) -> Tensor:
+    """T0 [source, time, receiver], nowhere negative; times may be infinite."""
+    times = times.detach().cpu().double()
+    asked = sorted({*times[times.isfinite()].tolist(), 0.0})
+    found = _derived(ring, tuple(asked))
+    mean = found.mean[:, torch.searchsorted(found.times, times.clamp(max=asked[-1]))].clone()
+    mean[:, times.isinf()] = found.long_time[:, None]
+    return _positive(mean, ring, times)
+
+
+def _positive(mean: Tensor, ring: Ring, times: Tensor) -> Tensor:
+    rows, own = torch.arange(len(mean)), torch.tensor(ring.tones) - 1
+    own = own // (ring.n_particles // 2 // ring.n_bands)
+    total = mean.sum(-1, keepdim=True)
+    moved = (total[..., 0] - mean[rows, :, own]).clamp(min=0)
+    softened = (mean + (mean.square() + (SOFT / ring.n_bands * moved[..., None]).square()).sqrt()) / 2
+    softened = softened * total / softened.sum(-1, keepdim=True).clamp(min=1e-300)
+    start = torch.zeros_like(mean[:, 0])
+    start[rows, own] = 1.0
+    softened[:, times == 0] = start[:, None]
+    return softened
+
+
+class TheoryModel(TransferModel):
+    """The transfer of the theory, times exponentials of polynomials where it has coefficients (see the module).
+
+    Args:
+        law_values, law_weights: of the masses, (node,); of the compliances for ``dual``.
+        n_particles: N.
+        tones: the sources, one in each band, (band,).
+        dual: 1 for random stiffnesses of equal masses, else 0.
+        contact_damping: of the contacts.
+        degrees: of the polynomials in place, distance and time, (3,); (0,) for none.
+        coefficients: of :func:`torchchain.master.compact.terms`, (term,).
+
+    Example:
+        >>> model = tc.master.TheoryModel.of(tc.Scene(n_particles=64, n_bands=8, disorder=tc.Disorder(strength=0.2)))
+        >>> model.n_parameters, model.transfer(torch.tensor([0.0, 10.0], dtype=torch.float64)).shape
+        (0, torch.Size([8, 2, 8]))
+    """
+
+    kind: ClassVar[str] = "theory"
+    axes: ClassVar[dict[str, tuple[str, ...]]] = {
+        "law_values": ("node",), "law_weights": ("node",), "n_particles": (), "tones": ("band",), "dual": (),
+        "contact_damping": (), "degrees": ("degree",), "coefficients": ("term",),
+    }  # fmt: skip
+    rates_meaning: ClassVar[str] = MemoryModel.rates_meaning
+
+    def __init__(
+        self, law_values: Tensor, law_weights: Tensor, n_particles: Tensor, tones: Tensor, dual: Tensor,
+        contact_damping: Tensor, degrees: Tensor, coefficients: Tensor,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        values, weights = (checks.real_tensor(n, v) for n, v in (("law_values", law_values), ("law_weights", law_weights)))
+        if values.ndim != 1 or values.shape != weights.shape or not len(values):
+            raise checks.fail("law_weights", f"have shape {tuple(values.shape)}", f"shape {tuple(weights.shape)}")
+        checks.first_bad("law_values", "be positive", values, ~(values > 0), "node")
+        checks.first_bad("law_weights", "be positive", weights, ~(weights > 0), "node")
+        n = _whole("n_particles", n_particles, 4)
+        bands = len(checks.real_tensor("tones", tones))
+        numbers = tuple(_whole("tones", tone, 1, n // 2) for tone in tones)
+        if not bands or n % (2 * bands) or [(tone - 1) // (n // 2 // bands) for tone in numbers] != list(range(bands)):
+            raise checks.fail("tones", "lie one in each band, in order", numbers)
+        loss = checks.number("contact_damping", float(contact_damping), at_least=0)
+        self.degrees_ = None if len(degrees) == 1 else checked_degrees([int(degree) for degree in degrees])
+        size = 0 if self.degrees_ is None else n_coefficients(self.degrees_)
+        coefficients = checks.real_tensor("coefficients", coefficients)
+        if tuple(coefficients.shape) != (size,):
+            raise checks.fail("coefficients", f"have shape {(size,)}", f"shape {tuple(coefficients.shape)}")
+        self.ring = Ring(
+            tuple(values.double().tolist()), tuple((weights.double() / weights.double().sum()).tolist()), n, bands, numbers,
+            bool(float(dual)), loss,
+        )  # fmt: skip
+        self.register_buffer("coefficients", coefficients.detach().clone())
+        self.coefficients: Tensor
+
+    @classmethod
+    def of(
+        cls, scene: Scene, degrees: tuple[int, int, int] | None = None, coefficients: Tensor | None = None
+    ) -> TheoryModel:
+        """The model of a scene's chains."""
+        check_scene(scene)
+        law, _ = described(
+            scene.disorder, scene.n_particles, scene.n_bands, scene.tones, scene.boundary, scene.stiffness_disorder,
+            scene.contact, scene.damping,
+        )  # fmt: skip
+        soft = scene.stiffness_disorder is not None and scene.stiffness_disorder.strength > 0
+        numbers = {"n_particles": scene.n_particles, "dual": soft, "contact_damping": scene.damping}
+        scalars = {name: torch.tensor(float(value), dtype=torch.float64) for name, value in numbers.items()}
+        return cls(
+            law_values=law.values, law_weights=law.weights, tones=torch.tensor(scene.tones, dtype=torch.float64),
+            degrees=torch.tensor(degrees or (0,), dtype=torch.float64),
+            coefficients=torch.zeros(0, dtype=torch.float64) if coefficients is None else coefficients, **scalars,
+        )  # fmt: skip
+
+    def tensors(self) -> dict[str, Tensor]:
+        new, ring = self.coefficients.new_tensor, self.ring
+        return {
+            "law_values": new(ring.values), "law_weights": new(ring.weights), "n_particles": new(float(ring.n_particles)),
+            "tones": new([float(tone) for tone in ring.tones]), "dual": new(float(ring.dual)),
+            "contact_damping": new(ring.damping), "degrees": new([float(d) for d in self.degrees_ or (0,)]),
+            "coefficients": self.coefficients,
+        }  # fmt: skip
+
+    @property
+    def n_bands(self) -> int:
+        return self.ring.n_bands
+
+    @property
+    def n_parameters(self) -> int:
+        return len(self.coefficients)
+
+    @property
+    def words(self) -> str:
+        if self.degrees_ is None:
+            return "from the law of the disorder, no fitted number"
+        return f"the theory's, degrees {self.degrees_}, {self.n_parameters} fitted numbers"
+
+    @property
+    def conservation_defect(self) -> float:
+        """Rows are divided by their sum."""
+        return 0.0
+
+    @property
+    def certificate(self) -> Certificate:
+        """By construction, for every t >= 0; the energy of damped chains falls to zero."""
+        rounding = 2 * self.n_bands * torch.finfo(self.coefficients.dtype).eps
+        return Certificate(0.0, 1.0 + rounding, math.inf if self.ring.damping else rounding, 0.0, 0)
+
+    @property
+    def damping(self) -> Tensor:  # type: ignore[override]
+        """None beside what the theory's own energies lose, [band]."""
+        return self.coefficients.new_zeros(self.n_bands)
+
+    @property
+    def basis(self) -> Tensor:  # type: ignore[override]
+        """Pi [source, receiver], T at infinite time."""
+        return self._at(self.coefficients.new_full((1,), math.inf))[:, 0]
+
+    @property
+    def rates(self) -> Tensor:
+        """Slopes at short times, by procedure L from t = 0.5 to 2, [source, receiver]."""
+        times = self.coefficients.new_tensor(RATE_TIMES)
+        return torch.einsum("t,str->sr", linear_weights(times, (RATE_TIMES[0], RATE_TIMES[-1])), self._at(times))
+
+    def _at(self, times: Tensor) -> Tensor:
+        found = derived(self.ring, times).to(self.coefficients)
+        if self.degrees_ is None:
+            return found
+        first, own = _shapes(self.ring, self.degrees_)
+        clock = polynomials(clock_of(times), self.degrees_[2])
+        p, q = terms(self.degrees_)
+        eye = torch.eye(self.n_bands).to(found)[:, None]
+        stays = power(own.to(found), clock, self.coefficients[len(p) :], q)
+        factor = power(first.to(found), clock, self.coefficients[: len(p)], p) * (1 - eye) + stays * eye
+        moved = found * factor
+        return moved * (found.sum(-1, keepdim=True) / moved.sum(-1, keepdim=True))
+
+    def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
+        return torch.einsum("...s,str->...tr", initial, self._at(times))
+
+    def as_memory(self, order: tuple[int, int] = (4, 6), span: float = 1e3) -> MemoryModel:
+        """The nearest model with memory, certified: see :meth:`CompactModel.as_memory`.
+
+        Raises:
+            FieldError: for damped chains.
+        """
+        if self.ring.damping:
+            raise checks.fail("method", "be 'expm' for the theory of damped chains, which has no equation", "another")
+        return nearest_memory(self, order, span)
+
+    def embedding(self) -> Embedding:
+        """That of the nearest model with memory (:meth:`as_memory`)."""
+        return self.as_memory().embedding()
+
+
+def _whole(name: str, value: Tensor, least: int, most: int | None = None) -> int:
+    number = float(value)
+    return checks.integer(name, int(number) if number.is_integer() else number, least, most)
+
+
+def _shapes(ring: Ring, degrees: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+    """Polynomials of place and distance for each pair, [source, receiver, term], and of place, [source, 1, term].
+
+    Distances are those of the wavenumbers over the widths of the lines in Born's approximation, xi^2 tan^2(k/2).
+    """
+    n, size = ring.n_bands, ring.n_particles
+    values, weights = (torch.tensor(x, dtype=torch.float64) for x in (ring.values, ring.weights))
+    mean = float((weights * values).sum())
+    spread = float((weights * (values - mean).square()).sum())
+    k = 2 * math.pi / size * torch.tensor(ring.tones, dtype=torch.float64)
+    width = spread * torch.tan(k.clamp(max=0.9 * math.pi) / 2).square() + FIRST_ROOM
+    far = torch.asinh((k[:, None] - k).abs() / (width[:, None] + width))
+    far = far / far.max().clamp(min=1e-9)
+    band = torch.arange(n, dtype=torch.float64) / max(n - 1, 1)
+    place, distance = polynomials((band[:, None] + band) / 2, degrees[0]), polynomials(far, degrees[1])
+    p, _ = terms(degrees)
+    pairs = list(dict.fromkeys((i, j) for i, j, _ in p))
+    return torch.stack([place[..., i] * distance[..., j] for i, j in pairs], -1), polynomials(band, degrees[0])[:, None]
+
+
+def check_scene(scene: Scene | None) -> None:
+    """Raise for chains that the theory does not hold for."""
+    if scene is None:
+        raise checks.fail("transfer", "be of chains of a scene for model 'theory'", "energies without one")
+    wanted: dict[str, Any] = {"lattice": None, "energy_definition": "site"}
+    for name, value in wanted.items():
+        if getattr(scene, name) != value:
+            raise checks.fail(name, f"be {value} for model 'theory'", getattr(scene, name))
+    described(
+        scene.disorder, scene.n_particles, scene.n_bands, scene.tones, scene.boundary, scene.stiffness_disorder,
+        scene.contact, scene.damping,
+    )  # fmt: skip
+    if len(scene.tones) != scene.n_bands:
+        raise checks.fail("n_bands", "have one tone each for model 'theory'", scene.n_bands)
+
+
+def check_corrected(scene: Scene | None) -> None:
+    """Raise for chains that the corrected theory is not made for."""
+    check_scene(scene)
+    assert scene is not None, "checked"
+    if scene.damping:
+        raise checks.fail("damping", "be 0 for model 'corrected_theory'", scene.damping)
+    if scene.n_bands < 2:
+        raise checks.fail("n_bands", "be at least 2 for model 'corrected_theory'", scene.n_bands)
+
+
+@dataclass(frozen=True)
+class CorrectionSettings:
+    """Settings of the correction.
+
+    Attributes:
+        degrees: in place, distance and time; None for the smallest that reach the ensemble's own error.
+    """
+
+    degrees: tuple[int, int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.degrees is not None:
+            object.__setattr__(self, "degrees", checked_degrees(self.degrees))
+
+
+def _derive(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
+    check_scene(sample.scene)
+    assert sample.scene is not None, "checked"
+    return TheoryModel.of(sample.scene), None
+
+
+def _regression(sample: Sample, degrees: tuple[int, int, int]) -> tuple[Regression, TheoryModel]:
+    assert sample.scene is not None, "checked"
+    start = TheoryModel.of(sample.scene, degrees, torch.zeros(n_coefficients(degrees), dtype=torch.float64))
+    times, data, weight = fit_points(sample.times, sample.mean, sample.long_time, sample.distance)
+    known = {t: i for i, t in enumerate(sample.times.tolist())}
+    whole = derived(start.ring, sample.times.double())  # at the times of the sample, where it is known from before
+    odds = torch.cat([
+        whole[:, [known[t] for t in times.tolist() if t in known]],
+        derived(start.ring, times[torch.tensor([t not in known for t in times.tolist()])]),
+    ], dim=1)  # fmt: skip
+    return Regression.of_odds(odds, _shapes(start.ring, degrees), degrees, times, data, weight), start
+
+
+def _correct(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
+    check_corrected(sample.scene)
+    degrees = recipe.settings.degrees
+    problem, model = _regression(sample, degrees)
+    first = near.coefficients if isinstance(near, TheoryModel) and near.degrees_ == degrees else model.coefficients
+    with single_blas_thread():
+        found, told = solve([problem], torch.ones(1, 1).double().numpy(), first.double().cpu().numpy()[None], progress)
+    tensors = model.tensors() | {"coefficients": torch.from_numpy(found[0])}
+    return TheoryModel(**tensors), CompactReport(told["converged"], told["steps"], told["misfit"], degrees)
+
+
+def _same(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: Tensor) -> Iterator[TheoryModel]:
+    """No ensemble comes into it."""
+    return iter([model] * len(repeats))
+
+
+def _again(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: Tensor) -> Iterator[TheoryModel]:
+    problem, _ = _regression(Sample.of(transfer), model.degrees_ or LADDER[0])
+    with single_blas_thread():
+        yield from refitted(problem, model, drawn_means(transfer, repeats))
+
+
+def _rungs(n_times: int) -> list[CorrectionSettings]:
+    """The degrees that so many times can tell apart, the smallest at least."""
+    return [CorrectionSettings(degrees) for degrees in LADDER if degrees == LADDER[0] or 2 * degrees[2] <= n_times]
+
+
+THEORY = ReducedModel(
+    "theory", "the theory of disorder: no fitted number, and no ensemble", TheoryModel,
+    (Fit("derivation", "from the law of the masses", _derive),), lambda n_bands, damped, settings: 0,
+    climbed_by="derivation", needs_strength=True, fits_loss=True, check_scene=check_scene, windows=(1.0, 5.0, 50.0),
+    near=NEAREST, replicas=_same,
+)  # fmt: skip
+CORRECTED = ReducedModel(
+    "corrected_theory", "the theory times exponentials of polynomials: some tens of numbers, never negative", TheoryModel,
+    (Fit("correction", "logistic regression on all times", _correct, settings=CorrectionSettings, report=CompactReport),),
+    lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="correction",
+    needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_corrected, windows=(1.0, 5.0, 50.0),
+    near=NEAREST, replicas=_again,
+)  # fmt: skip
