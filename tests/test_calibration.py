@@ -9,7 +9,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.master import NonlinearReport, Report, Rung
+from torchchain.master import NonlinearReport, Report
 from torchchain.master.fits import FitWarning, profile
 from torchchain.master.memory import MemoryModel
 
@@ -270,9 +270,9 @@ def test_projection_chooses_an_order():
     transfer = transfer_of(mean, long_time=basis, noise=0.01)
     master = tc.calibrate(transfer)
     assert master.calibration.report.fit.order == (1, 1)
-    assert master.calibration.report.selection.tried[1] == Rung(
-        "memory", (1, 0), master.calibration.report.selection.tried[1].distance
-    )
+    tried = master.calibration.report.selection.tried
+    assert ("memory", (1, 0)) in [(rung.model, rung.order) for rung in tried]
+    assert [rung.model for rung in tried[:2]] == ["theory", "corrected_theory"]
     again = tc.calibrate(transfer)
     assert torch.equal(again.model.amplitudes, master.model.amplitudes)
 

@@ -21,6 +21,9 @@ from torchchain.ensemble.scene import Scene
 from torchchain.threads import single_thread
 
 ARTIFACT = "master equation"
+THEORY = "theory"
+STAND_INS = (ARTIFACT, THEORY)
+"""What can take the place of the chains."""
 ORDERED_TOLERANCE = 1e-9
 FRACTION_OF_NOISE = 1 / 3  # adds 5 % to the statistical error
 CONTACT_FRACTION = 0.9  # of the tolerance that linear contacts may take up; the method has the rest
@@ -61,7 +64,7 @@ class Plan(Printed):
 
     Attributes:
         scene: the scene with its contact law settled.
-        method: name in ``evolvers.METHODS``, or "master equation" for an artifact at hand.
+        method: name in ``evolvers.METHODS``, "master equation" for an artifact at hand, or "theory" where no chains are needed.
         options: of the method.
         dtype: precision of the chains.
         tolerance: error that the plan keeps to, relative to the scale of the observables.
@@ -174,7 +177,7 @@ def _plan(scene: Scene, stand_in: StandIn | None) -> Plan:
             f"be at least {nearest.predicted_error:.1e}, what method '{nearest.method}' reaches here",
             tolerance,
         )
-    loaded = [choice for choice in good if choice.method == ARTIFACT or not scene.methods[choice.method].compiled]
+    loaded = [choice for choice in good if choice.method in STAND_INS or not scene.methods[choice.method].compiled]
     best = loaded[0] if loaded and loaded[0].cost < SMALL_WORK else good[0]
     reasons = [*reasons, *why, *_method_reasons(best, good, facts, usable), *remarks]
     return Plan(
@@ -318,7 +321,7 @@ def _layout(name: str, scene: Scene) -> Layout | None:
 def _method_reasons(
     best: Choice, good: list[Choice], facts: Facts | LatticeFacts, layouts: Mapping[str, Layout]
 ) -> list[str]:
-    reasons = [] if best.method == ARTIFACT else [f"'{best.method}': {facts.scene.methods[best.method].summary}"]
+    reasons = [] if best.method in STAND_INS else [f"'{best.method}': {facts.scene.methods[best.method].summary}"]
     if best is not good[0]:
         reasons.append(f"'{good[0]}' would be faster, but {SMALL_WORK:g} s of work are not worth loading its kernels")
     elif len(good) > 1:
@@ -329,7 +332,7 @@ def _method_reasons(
     if isinstance(facts, Facts) and facts.part is not None:
         n, whole = facts.n, facts.scene.n_particles
         reasons.append(f"the wave reaches {n} of {whole} particles by the last time: the others are left out")
-    if best.method != ARTIFACT:
+    if best.method not in STAND_INS:
         cut = layouts[best.method].chunks(facts.chains)
         reasons.append(
             f"{facts.scene.kind}s {facts.chains}, in chunks of {min(cut.size, facts.chains)}, {cut.workers} side by side"

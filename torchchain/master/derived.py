@@ -137,11 +137,15 @@ class TheoryModel(TransferModel):
         contact_damping: Tensor, degrees: Tensor, coefficients: Tensor,
     ) -> None:  # fmt: skip
         super().__init__()
-        values, weights = (checks.real_tensor(n, v) for n, v in (("law_values", law_values), ("law_weights", law_weights)))
+        values, weights = (
+            checks.real_tensor(n, v) for n, v in (("law_values", law_values), ("law_weights", law_weights))
+        )
         if values.ndim != 1 or values.shape != weights.shape or not len(values):
             raise checks.fail("law_weights", f"have shape {tuple(values.shape)}", f"shape {tuple(weights.shape)}")
         checks.first_bad("law_values", "be positive", values, ~(values > 0), "node")
         checks.first_bad("law_weights", "be positive", weights, ~(weights > 0), "node")
+        if abs(float(weights.sum()) - 1) > 1e-4:
+            raise checks.fail("law_weights", "add up to 1", float(weights.sum()))
         n = _whole("n_particles", n_particles, 4)
         bands = len(checks.real_tensor("tones", tones))
         numbers = tuple(_whole("tones", tone, 1, n // 2) for tone in tones)
@@ -154,7 +158,7 @@ class TheoryModel(TransferModel):
         if tuple(coefficients.shape) != (size,):
             raise checks.fail("coefficients", f"have shape {(size,)}", f"shape {tuple(coefficients.shape)}")
         self.ring = Ring(
-            tuple(values.double().tolist()), tuple((weights.double() / weights.double().sum()).tolist()), n, bands, numbers,
+            tuple(values.double().tolist()), tuple(weights.double().tolist()), n, bands, numbers,
             bool(float(dual)), loss,
         )  # fmt: skip
         self.register_buffer("coefficients", coefficients.detach().clone())
@@ -166,10 +170,7 @@ class TheoryModel(TransferModel):
     ) -> TheoryModel:
         """The model of a scene's chains."""
         check_scene(scene)
-        law, _ = described(
-            scene.disorder, scene.n_particles, scene.n_bands, scene.tones, scene.boundary, scene.stiffness_disorder,
-            scene.contact, scene.damping,
-        )  # fmt: skip
+        law, _ = covered(scene)
         soft = scene.stiffness_disorder is not None and scene.stiffness_disorder.strength > 0
         numbers = {"n_particles": scene.n_particles, "dual": soft, "contact_damping": scene.damping}
         scalars = {name: torch.tensor(float(value), dtype=torch.float64) for name, value in numbers.items()}
@@ -289,16 +290,21 @@ def check_scene(scene: Scene | None) -> None:
     """Raise for chains that the theory does not hold for."""
     if scene is None:
         raise checks.fail("transfer", "be of chains of a scene for model 'theory'", "energies without one")
+    covered(scene)
+    if len(scene.tones) != scene.n_bands:
+        raise checks.fail("n_bands", "have one tone each for model 'theory'", scene.n_bands)
+
+
+def covered(scene: Scene) -> tuple[Law, Waves]:
+    """The law and the waves of a scene; an error for chains that the theory does not hold for."""
     wanted: dict[str, Any] = {"lattice": None, "energy_definition": "site"}
     for name, value in wanted.items():
         if getattr(scene, name) != value:
             raise checks.fail(name, f"be {value} for model 'theory'", getattr(scene, name))
-    described(
+    return described(
         scene.disorder, scene.n_particles, scene.n_bands, scene.tones, scene.boundary, scene.stiffness_disorder,
         scene.contact, scene.damping,
     )  # fmt: skip
-    if len(scene.tones) != scene.n_bands:
-        raise checks.fail("n_bands", "have one tone each for model 'theory'", scene.n_bands)
 
 
 def check_corrected(scene: Scene | None) -> None:

@@ -16,7 +16,9 @@ from torchchain.energy.start_energy import StartEnergy, excited
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.plan import ARTIFACT, Choice, Plan, statistical_error
 from torchchain.ensemble.scene import Scene
+from torchchain.master.derived import covered
 from torchchain.master.equation import MasterEquation
+from torchchain.theory.transfer import predicted_error
 
 PREDICTED = frozenset({"band_energy", "long_time_band_energy"})
 
@@ -84,7 +86,41 @@ def plan(scene: Scene, artifact: str | Path | MasterEquation | None = None) -> P
         >>> plan.predicted_error <= 1e-6, plan.dtype
         (True, torch.float64)
     """
-    return planning.plan(scene, None if artifact is None else partial(_stand_in, artifact=artifact))
+    return planning.plan(scene, partial(_stand_ins, artifact=artifact))
+
+
+def _stand_ins(
+    scene: Scene, tolerance: float, artifact: str | Path | MasterEquation | None
+) -> tuple[list[Choice], list[str]]:
+    """The artifact at hand, if there is one, and the theory."""
+    choices, remarks = ([], []) if artifact is None else _stand_in(scene, tolerance, artifact)
+    derived, told = _theory(scene, tolerance)
+    return [*choices, *derived], [*remarks, *told]
+
+
+def _theory(scene: Scene, tolerance: float) -> tuple[list[Choice], list[str]]:
+    """The theory of disorder, where it covers the scene and its estimated error is within what is allowed.
+
+    Where no tolerance is asked for, it is told of if it is nearer to an endless ensemble than the scene's is, but not chosen.
+    """
+    if not set(scene.observables) <= PREDICTED or not isinstance(scene.excitation, StandingWave) or scene.is_ordered:
+        return [], []
+    try:
+        law, waves = covered(scene)
+    except checks.FieldError:
+        return [], []
+    allowed = tolerance if scene.tolerance is not None else statistical_error(scene)
+    expected = float(predicted_error(law, waves, scene.times).max())
+    if expected > allowed:
+        return [], []
+    n, times, sources = scene.n_bands, len(scene.times), len(scene.tones)
+    work = 0.1 + sources * (4e-3 + n * (2e-4 + 2e-6 * times))
+    told = (
+        f"no chains needed: theory gives the energies of bands to {expected:.1e}, {allowed:.1e} allowed "
+        '(band_transfer(scene, method="theory"))'
+    )
+    choice = Choice(planning.THEORY, {}, expected, work, work * planning.speed(), allowed)
+    return [choice] if scene.tolerance is not None else [], [told]
 
 
 def _stand_in(scene: Scene, tolerance: float, artifact: str | Path | MasterEquation) -> tuple[list[Choice], list[str]]:
