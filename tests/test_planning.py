@@ -101,6 +101,38 @@ def test_float32_as_chosen_keeps_to_the_tolerance():
     assert float(abs(found - exact).max() / abs(exact).max()) <= 1e-2
 
 
+RING = {"boundary": "periodic", "excitation": tc.StandingWave(), "observables": ("band_energy",), "n_bands": 8}
+
+
+def test_theory_is_offered_where_its_error_meets_the_tolerance():
+    many = scene(**RING, realizations=400, disorder=tc.Disorder(strength=0.05), tolerance=0.02)
+    planned = plan(many)
+    choice = next(choice for choice in planned.choices if choice.method == "theory")
+    assert choice.predicted_error <= 0.02
+    assert any("no chains needed" in reason for reason in planned.reasons)
+    measured = tc.band_transfer(many)
+    off = (tc.band_transfer(many, method="theory").mean - measured.mean).abs()
+    assert float((off - 5 * measured.stderr).max()) <= choice.predicted_error
+    strict = plan(scene(**RING, realizations=400, disorder=tc.Disorder(strength=0.05), tolerance=1e-5))
+    assert all(choice.method != "theory" for choice in strict.choices)
+
+
+def test_theory_takes_the_place_of_very_many_chains():
+    planned = plan(
+        scene(**RING, n_particles=256, realizations=10**5, disorder=tc.Disorder(strength=0.05), tolerance=0.02)
+    )
+    assert planned.method == "theory"
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"boundary": "fixed"}, {"observables": ("band_energy", "energy")}, {"disorder": tc.Disorder(strength=0.0)}],
+)
+def test_theory_is_not_offered_for_what_it_does_not_give(fields):
+    planned = plan(scene(**RING | fields, tolerance=0.5))
+    assert all(choice.method != "theory" for choice in planned.choices)
+
+
 VARIED = [
     {"excitation": tc.Impulse(site=32), "observables": ("energy",), "boundary": "periodic"},
     {"excitation": tc.StandingWave(tones=(5, 20)), "observables": ("displacement",)},
@@ -116,7 +148,7 @@ def test_predicted_errors_are_bounds(fields, tolerance):
     wanted = scene(**fields, tolerance=tolerance)
     for choice in plan(wanted).choices:
         options = {**choice.options, **({"dtype": "float32"} if choice.dtype == torch.float32 else {})}
-        if not choice.good or options.get("step", 1.0) < 1e-3:
+        if not choice.good or options.get("step", 1.0) < 1e-3 or choice.method == "theory":  # of an endless ensemble
             continue
         found = tc.simulate(wanted, choice.method, options=options)
         exact = tc.simulate(wanted, "chebyshev" if choice.method == "modes" else "modes")

@@ -1,0 +1,138 @@
+"""The theory as a reduced model, and the corrected theory: exact properties, file, selection, and distance from fresh chains."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import torchchain as tc
+from torchchain.checks import FieldError
+from torchchain.master import TheoryModel
+from torchchain.master.compact import n_coefficients
+
+F64 = torch.float64
+TIMES = torch.cat([torch.arange(0.0, 2.0, 0.25), torch.arange(2.0, 60.0, 4.0)]).double()
+SCENE = tc.Scene(n_particles=64, n_bands=8, disorder=tc.Disorder(strength=0.3), times=TIMES, realizations=40, seed=4)
+LATE = torch.tensor([0.0, 0.1, 1.0, 13.0, 700.0, 1e4, 1e7, torch.inf], dtype=F64)
+
+
+@pytest.fixture(scope="module")
+def transfer():
+    return tc.band_transfer(SCENE, method="modes")
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    return tc.band_transfer(replace(SCENE, seed=5, realizations=400), method="modes")
+
+
+def distance(a, b):
+    """Total variation, mean over sources and times above 2."""
+    return float((a - b)[:, TIMES > 2].abs().sum(-1).mean() / 2)
+
+
+def corrected(scale):
+    size = n_coefficients((2, 2, 4))
+    noise = torch.randn(size, generator=torch.Generator().manual_seed(1), dtype=F64)
+    return TheoryModel.of(SCENE, (2, 2, 4), scale * noise)
+
+
+def test_without_a_fitted_number_it_is_the_theory(transfer):
+    master = tc.calibrate(transfer, model="theory")
+    theory = tc.band_transfer(SCENE, method="theory")
+    assert master.n_parameters == 0
+    # where the theory is slightly negative, as an ensemble's mean is, there is hardly anything; the rest is scaled
+    positive = theory.mean.clamp(min=0)
+    positive = positive / positive.sum(-1, keepdim=True)
+    torch.testing.assert_close(master.transfer(TIMES), positive, rtol=0, atol=1e-4)
+    torch.testing.assert_close(master.basis, theory.long_time, rtol=0, atol=1e-5)
+
+
+def test_zero_coefficients_change_nothing():
+    torch.testing.assert_close(corrected(0.0).transfer(LATE), TheoryModel.of(SCENE).transfer(LATE), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3, 30.0])
+def test_any_coefficients_give_a_transfer_that_conserves_energy_and_is_never_negative(scale):
+    found = corrected(scale).transfer(LATE)
+    assert float(found.min()) >= 0
+    torch.testing.assert_close(found.sum(-1), torch.ones(8, len(LATE), dtype=F64), rtol=0, atol=1e-13)
+    torch.testing.assert_close(found[:, 0], torch.eye(8, dtype=F64), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("settings", [{}, {"model": "corrected_theory", "degrees": (1, 1, 2)}])
+def test_file_holds_all_that_it_needs(transfer, tmp_path, settings):
+    master = tc.calibrate(transfer, **({"model": "theory"} | settings))
+    master.save(tmp_path / "q.safetensors")
+    again = tc.MasterEquation.load(tmp_path / "q.safetensors")
+    assert torch.equal(again.transfer(LATE[:-1]), master.transfer(LATE[:-1]))
+    assert torch.equal(again.basis, master.basis)
+    assert again.n_parameters == master.n_parameters == (9 if settings else 0)
+    assert again.calibration.report.certificate.holds
+
+
+def test_the_theory_is_chosen_where_it_is_as_near_as_another_ensemble(transfer, fresh):
+    master = tc.calibrate(transfer, bootstrap=0)
+    assert [rung.model for rung in master.calibration.report.selection.tried] == ["theory"]
+    assert distance(master.transfer(TIMES), fresh.mean) < distance(transfer.mean, fresh.mean)
+
+
+def test_correction_comes_nearer_to_what_it_was_fitted_to(fresh):
+    theory, mended = (tc.calibrate(fresh, bootstrap=0, **settings) for settings in (
+        {"model": "theory"}, {"model": "corrected_theory", "degrees": (4, 4, 8)}))  # fmt: skip
+    assert distance(mended.transfer(TIMES), fresh.mean) < 0.85 * distance(theory.transfer(TIMES), fresh.mean)
+
+
+def test_correction_recovers_what_was_changed():
+    changed = corrected(0.3)
+    exact = changed.transfer(TIMES)
+    late = changed.transfer(LATE[-1:])[:, 0]
+    data = replace(tc.band_transfer(SCENE, method="theory"), mean=exact, long_time=late)
+    master = tc.calibrate(data, model="corrected_theory", degrees=(2, 2, 4), bootstrap=0)
+    bare = distance(TheoryModel.of(SCENE).transfer(TIMES), exact)
+    assert bare > 0.02
+    assert distance(master.transfer(TIMES), exact) < 0.15 * bare
+
+
+def test_damped_chains_lose_the_energy_that_the_theory_says():
+    scene = replace(SCENE, damping=0.05, realizations=20, disorder=tc.Disorder(strength=0.2))
+    transfer = tc.band_transfer(scene, long_time=False)
+    master = tc.calibrate(transfer, model="theory")
+    found = master.transfer(TIMES)
+    torch.testing.assert_close(found.sum(-1), transfer.mean.sum(-1), rtol=0, atol=0.006)
+    assert float(found.min()) >= 0
+    with pytest.raises(FieldError, match="method must be 'expm' for the theory of damped chains"):
+        master.solve(torch.eye(8, dtype=F64), TIMES, method="dopri5")
+
+
+def test_error_bars_hold_the_misfit_though_nothing_is_drawn_again(transfer, fresh):
+    master = tc.calibrate(transfer, model="theory")
+    error = master.uncertainty.stderr
+    assert bool((error >= 0).all())
+    off = (master.transfer(TIMES) - fresh.mean).abs()
+    allowed = 3 * (master.standard_error(torch.eye(8, dtype=F64), TIMES) + fresh.stderr) + 0.004
+    assert float((off <= allowed).double().mean()) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [({"boundary": "fixed"}, "boundary must be 'periodic'"), ({"energy_definition": "bond"}, "energy_definition must be site")],
+)  # fmt: skip
+def test_chains_that_the_theory_does_not_hold_for_are_refused(fields, words):
+    with pytest.raises(FieldError, match=words):
+        TheoryModel.of(replace(SCENE, **fields))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("coefficients", torch.zeros(2, dtype=F64), "coefficients must have shape"),
+        ("tones", torch.arange(1.0, 9.0, dtype=F64), "tones must lie one in each band"),
+        ("law_weights", torch.full((48,), 0.5, dtype=F64), "law_weights must add up to 1"),
+        ("n_particles", torch.tensor(64.5, dtype=F64), "n_particles must be an integer"),
+    ],
+)
+def test_tensors_that_make_no_model_are_refused(name, value, words):
+    tensors = TheoryModel.of(SCENE).tensors() | {name: value}
+    with pytest.raises((FieldError, TypeError), match=words):
+        TheoryModel(**tensors)
