@@ -101,8 +101,8 @@ def test_damped_chains_lose_the_energy_that_the_theory_says():
     found = master.transfer(TIMES)
     torch.testing.assert_close(found.sum(-1), transfer.mean.sum(-1), rtol=0, atol=0.006)
     assert float(found.min()) >= 0
-    with pytest.raises(FieldError, match="method must be 'expm' for the theory of damped chains"):
-        master.solve(torch.eye(8, dtype=F64), TIMES, method="dopri5")
+    solved = master.solve(torch.eye(8, dtype=F64), TIMES, method="dopri5")  # by the nearest model with memory
+    assert distance(solved, found) < 0.01
 
 
 def test_error_bars_hold_the_misfit_though_nothing_is_drawn_again(transfer, fresh):

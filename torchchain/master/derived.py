@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,8 +33,8 @@ from torchchain.master.compact import (
     power,
     terms,
 )
-from torchchain.master.fits import linear_weights
 from torchchain.master.compact_record import CompactReport, drawn_again
+from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import Regression, fit_points, solve, stepped
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import Embedding, TransferModel
@@ -247,14 +248,8 @@ class TheoryModel(TransferModel):
         return torch.einsum("...s,str->...tr", initial, self._at(times))
 
     def as_memory(self, order: tuple[int, int] = (4, 6), span: float = 1e3) -> MemoryModel:
-        """The nearest model with memory, certified: see :meth:`CompactModel.as_memory`.
-
-        Raises:
-            FieldError: for damped chains.
-        """
-        if self.ring.damping:
-            raise checks.fail("method", "be 'expm' for the theory of damped chains, which has no equation", "another")
-        return nearest_memory(self, order, span)
+        """The nearest model with memory: see :meth:`CompactModel.as_memory`."""
+        return nearest_memory(self, order, span, self.ring.damping > 0)
 
     def embedding(self) -> Embedding:
         """That of the nearest model with memory (:meth:`as_memory`)."""
@@ -357,7 +352,7 @@ def _correct(sample: Sample, recipe: Recipe, near: TransferModel | None, progres
     problem, model = _regression(sample, degrees)
     first = near.coefficients if isinstance(near, TheoryModel) and near.degrees_ == degrees else model.coefficients
     with single_blas_thread():
-        found, told = solve([problem], torch.ones(1, 1).double().numpy(), first.double().cpu().numpy()[None], progress)
+        found, told = solve([problem], np.ones((1, 1)), first.double().cpu().numpy()[None], progress)
     tensors = model.tensors() | {"coefficients": torch.from_numpy(found[0])}
     return TheoryModel(**tensors), CompactReport(told["converged"], told["steps"], told["misfit"], degrees)
 
@@ -369,8 +364,11 @@ def _same(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: T
 
 def _again(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: Tensor) -> Iterator[TheoryModel]:
     problem, _ = _regression(Sample.of(transfer), model.degrees_ or LADDER[0])
+    found = model.coefficients.detach().double().cpu().numpy()[None]
     with single_blas_thread():
-        yield from refitted(problem, model, drawn_means(transfer, repeats))
+        others = stepped([problem], np.ones((1, 1)), found, [drawn_again(transfer, repeats).numpy()])[:, 0]
+    for other in others:
+        yield TheoryModel(**model.tensors() | {"coefficients": torch.from_numpy(other)})
 
 
 def _rungs(n_times: int) -> list[CorrectionSettings]:
@@ -382,12 +380,12 @@ THEORY = ReducedModel(
     "theory", "the theory of disorder: no fitted number, and no ensemble", TheoryModel,
     (Fit("derivation", "from the law of the masses", _derive),), lambda n_bands, damped, settings: 0,
     climbed_by="derivation", needs_strength=True, fits_loss=True, check_scene=check_scene, windows=(1.0, 5.0, 50.0),
-    near=NEAREST, replicas=_same,
+    near=NEAREST, never_negative=True, replicas=_same,
 )  # fmt: skip
 CORRECTED = ReducedModel(
     "corrected_theory", "the theory times exponentials of polynomials: some tens of numbers, never negative", TheoryModel,
     (Fit("correction", "logistic regression on all times", _correct, settings=CorrectionSettings, report=CompactReport),),
     lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="correction",
     needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_corrected, windows=(1.0, 5.0, 50.0),
-    near=NEAREST, replicas=_again,
+    near=NEAREST, never_negative=True, replicas=_again,
 )  # fmt: skip
