@@ -35,7 +35,7 @@ class Config:
     """disorders xi, of uniformly distributed masses"""
     square_scalar: tuple[float, ...] = (0.1, 0.12, 0.145, 0.17, 0.2, 0.23)
     """wavelengths per spacing of the waves along an axis"""
-    triangular_longitudinal: tuple[float, ...] = (0.0688, 0.075, 0.0875, 0.1, 0.1125, 0.125)
+    triangular_longitudinal: tuple[float, ...] = (0.08125, 0.0875, 0.1, 0.10625, 0.11875, 0.13125)
     """the same along a bond"""
     triangular_transverse: tuple[float, ...] = (0.11, 0.13, 0.155, 0.18, 0.21, 0.25)
     """the same along a bond"""
