@@ -40,6 +40,8 @@ TOGETHER = 2**22
 """Pairs of tones times times that are computed at once."""
 FOLLOWED = 0.125
 """Share of the data's variance, which is much the same at neighboring times, that stays in the smooth functions fitted to them."""
+CONTROL = 0.8
+"""Share of the chance deviation of the released waves of fewer chains from all chains that kicks have too."""
 EVENNESS = 0.5
 """Weight of a source's own error in a fit, rather than of the mean over sources."""
 
@@ -204,7 +206,8 @@ def can_fit(transfer: BandTransfer) -> bool:
 def fit_starts(transfer: BandTransfer) -> StartModel:
     """The model of a transfer's starts; half of a second for 32 bands.
 
-    Waves released at rest also see the calibrated tones of the whole ensemble. Where its long-time average is known both
+    Waves released at rest also see the calibrated tones of the whole ensemble; by what they are then off on the chains that
+    were kicked, the kicks are put right as well (a control variate). Where its long-time average is known both
     kinds are held to it: what kicks then differ by is taken from the last time.
     """
     scene, starts = transfer.scene, transfer.starts
@@ -227,6 +230,9 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
             told = [(numbers, starts.times[later], mean, stderr)]
             if kind == KINDS[0] and len(picked):
                 told = [(numbers[~center], starts.times[later], mean[~center], stderr[~center]), (own, *whole)]
+            if kind == KINDS[1]:
+                fitted = shares(tones, KINDS[0], degrees, coefficients[KINDS[0]], numbers, starts.times[later])
+                told[0] = (numbers, starts.times[later], mean + CONTROL * (fitted - starts.released[:, later]), stderr)
             if late is not None:
                 end, error = late.double(), whole[2][:, -1:]
                 if kind == KINDS[1]:
