@@ -94,7 +94,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     torch.manual_seed(config.seed)  # of the mixtures alone
     weights = torch.rand(config.mixtures, 128, dtype=torch.float64) ** 8
     entries: list[dict[str, Any]] = []
-    members = []
+    members, owns = [], []
     fresh: dict[float, tc.BandTransfer] = {}
     size = (config.n_particles, config.n_bands)
     for strength in config.strengths:
@@ -105,8 +105,9 @@ def measure(config: Config, device: str) -> xarray.Dataset:
         for rung in rungs(config):
             master, fit = _calibrated(own, rung)
             entries.append(_score(rung[0], master, own, fresh[strength], weights, fit, seconds))
-        members.append(master if master.calibration.model == "memory" else tc.calibrate(own, "projection"))
-    family = tc.MasterFamily(members)
+        members.append(master)
+        owns.append(own)
+    family = tc.calibrate_family(owns)
     for strength in config.unseen:
         own = _ensemble(config, strength, config.seed, config.realizations, *size, device)  # for its error alone
         other = _ensemble(config, strength, config.fresh_seed, config.fresh_realizations, *size, device)

@@ -235,6 +235,29 @@ def test_family_predicts_a_strength_between():
         family.at(0.5)
 
 
+def test_a_family_is_small_and_near_at_unseen_strengths():
+    """Five ensembles; at strengths that none has, the error bars hold what interpolation is off by."""
+    times = [*np.arange(0, 5, 0.25), *np.arange(5, 50.1, 1.0)]
+
+    def ensemble(strength, seed):
+        disorder = tc.Disorder(strength=strength)
+        return tc.band_transfer(
+            tc.Scene(n_particles=128, n_bands=B, realizations=100, seed=seed, times=times, disorder=disorder)
+        )
+
+    family = tc.calibrate_family([ensemble(strength, 0) for strength in (0.05, 0.1, 0.2, 0.3, 0.5)])
+    assert family.n_parameters <= 1500
+    eye = torch.eye(B, dtype=torch.float64)
+    for strength in (0.02, 0.07, 0.14, 0.4):
+        unseen, master = ensemble(strength, 1), family.at(strength)
+        off = tc.total_variation(master.transfer(times), unseen.mean)[:, 1:].mean()
+        # measured 1.0 to 1.75, of which the ensemble itself is 1
+        assert float(off) < 2 * float(distance(unseen)[1:].mean())
+        error = master.standard_error(eye, times).square() + unseen.stderr.square()
+        inside = ((master.transfer(times) - unseen.mean).square() < error)[:, 1:]
+        assert 0.6 < float(inside.double().mean()) < 0.95
+
+
 # The model's own error
 
 
