@@ -209,7 +209,7 @@ def _step_error(entry: Method, facts: Facts) -> float:
     assert entry.order_in_step is not None
     if facts.scene.observables == ("total_energy",) and facts.scene.damping == 0:
         swing = 6 * entry.phase_error if math.isnan(entry.energy_error) else entry.energy_error
-        return 3 * swing * facts.frequency(entry.order_in_step)
+        return 3 * swing * facts.frequency(entry.order_in_step // 2) ** 2  # modes' energies add, with their weights
     margin = 5 if "displacement" in facts.scene.observables else 3
     return margin * entry.phase_error * facts.frequency(entry.order_in_step + 1) * max(facts.growing, 1.0)
 
