@@ -338,7 +338,7 @@ def test_a_calibrated_model_that_does_not_fit_is_named_and_left(master, fields, 
     plain = tc.MasterEquation(master.model, master.calibration, master.uncertainty)  # without the starts it measured
     planned = plan(transfer_scene(**fields), artifact=plain)
     assert planned.method != planning.ARTIFACT
-    assert words in planned.reasons[-1]
+    assert any(words in reason for reason in planned.reasons)
 
 
 def test_command_plan_takes_a_model_file(master, tmp_path, capsys):
