@@ -95,7 +95,7 @@ def _stand_ins(
     """The artifact at hand, if there is one, and the theory."""
     choices, remarks = ([], []) if artifact is None else _stand_in(scene, tolerance, artifact)
     derived, told = _theory(scene, tolerance)
-    return [*choices, *derived], [*remarks, *told]
+    return [*choices, *derived], [*told, *remarks]
 
 
 def _theory(scene: Scene, tolerance: float) -> tuple[list[Choice], list[str]]:
