@@ -1,4 +1,5 @@
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -199,3 +200,14 @@ def test_a_kick_too_hard_for_linear_contacts_is_refused():
     scene = si_scene(si={**STEEL, "velocity": 1.0, "times": [0.0, 1e-4]})
     with pytest.raises(FieldError, match="excitation must stretch no linear contact beyond the initial overlap 1"):
         tc.simulate(scene, "chebyshev")
+
+
+def test_masses_in_other_units_are_remarked_upon():
+    chain = tc.Chain(torch.full((16,), 2.5e-4, dtype=torch.float64))
+    with pytest.warns(tc.UnitsWarning, match=r"masses have mean 0\.00025, .* travels 63\.2 particles per unit of time"):
+        tc.evolve(chain, tc.impulse(chain), [0.0, 1.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for factor in (0.6, 1.9):  # a mean by chance
+            usual = tc.Chain(factor * torch.ones(16, dtype=torch.float64))
+            tc.evolve(usual, tc.impulse(usual), [0.0, 1.0])

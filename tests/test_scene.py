@@ -1,3 +1,7 @@
+import copy
+import pickle
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -220,3 +224,20 @@ def test_unreadable_files(tmp_path):
     with pytest.raises(FieldError, match="must be a TOML file, got 'utf-8' codec") as caught:
         read_toml(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_misspelled_field_names_the_one_meant():
+    with pytest.raises(tc.FieldTypeError, match="a scene has no field 'n_particle'; did you mean n_particles?"):
+        tc.Scene(n_particle=8)
+    scene = tc.Scene(n_particles=8, n_bands=2)
+    assert copy.deepcopy(scene).to_dict() == pickle.loads(pickle.dumps(scene)).to_dict() == scene.to_dict()
+
+
+def test_a_plan_is_ten_lines_at_most():
+    scene = tc.Scene(
+        n_particles=4096, boundary="fixed", excitation=tc.Impulse(), observables=("center",), times=[0.0, 20.0]
+    )
+    for each in (scene, replace(scene, contact="auto"), tc.Scene(damping=0.1), tc.Scene(tolerance=1e-4)):
+        plan = tc.plan(each)
+        assert 6 <= len(repr(plan).splitlines()) <= 10
+        assert all(reason in repr(plan) for reason in plan.reasons)

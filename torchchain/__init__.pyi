@@ -20,6 +20,7 @@ from torchchain.chain import Scaling as Scaling
 from torchchain.chain import StandingWave as StandingWave
 from torchchain.chain import State as State
 from torchchain.chain import Trajectory as Trajectory
+from torchchain.chain import UnitsWarning as UnitsWarning
 from torchchain.chain import impulse as impulse
 from torchchain.chain import linearity as linearity
 from torchchain.chain import standing_wave as standing_wave

@@ -11,7 +11,7 @@ TOPICS: dict[str, tuple[str, str]] = {
     "chains": (
         "Chains, disorder, starts",
         "Chain Disorder StandingWave Impulse standing_wave impulse State Trajectory Scaling linearity Linearity "
-        "LinearityWarning chain.BOUNDARIES chain.CONTACTS",
+        "LinearityWarning UnitsWarning chain.BOUNDARIES chain.CONTACTS",
     ),
     "motion": (
         "Motion and modes",

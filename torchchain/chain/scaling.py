@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, fields
 from typing import Any
 
 from torchchain import checks
+from torchchain.chain.chain import Chain
 
 QUANTITIES = ("time", "length", "velocity", "mass", "force", "energy", "stiffness", "frequency", "damping")
 
@@ -108,3 +110,42 @@ class Scaling:
     def from_si(self, quantity: str, value: Any) -> Any:
         """A value in SI units made dimensionless; tensors and arrays pass through."""
         return value / self.unit(quantity)
+
+
+FAR = 2.0
+"""Mean masses beyond this, or below one over it, are remarked upon."""
+
+
+class UnitsWarning(UserWarning):
+    """Masses whose mean is far from 1, the unit here: times are then no longer those of sound over one particle.
+
+    Example:
+        >>> import warnings
+        >>> chain = tc.Chain(torch.full((16,), 2.5e-4, dtype=torch.float64))  # in kg, perhaps
+        >>> with warnings.catch_warnings(record=True) as told:
+        ...     warnings.simplefilter("always")
+        ...     _ = tc.evolve(chain, tc.impulse(chain), [0.0, 1.0])
+        >>> [warning.category.__name__ for warning in told]
+        ['UnitsWarning']
+    """
+
+
+def warn_if_unscaled(chain: Chain, stacklevel: int = 2) -> None:
+    """A :class:`UnitsWarning` where the masses of chains have a mean far from 1.
+
+    Args:
+        chain: masses (*batch, particle).
+        stacklevel: whose line the warning names, as in :func:`warnings.warn`.
+    """
+    if checks.is_transformed(chain.masses):
+        return
+    mean = chain.masses.detach().mean().item()
+    if 1 / FAR <= mean <= FAR:
+        return
+    speed = math.sqrt(chain.contact_stiffness.detach().mean().item() / mean)
+    warnings.warn(
+        f"masses have mean {mean:.3g}, where the unit of mass is their mean: sound travels {speed:.3g} particles per unit of "
+        "time, not one (divide masses by their mean and stiffnesses by theirs, or see Scaling)",
+        UnitsWarning,
+        stacklevel=stacklevel,
+    )

@@ -116,7 +116,7 @@ class Plan(Printed):
             "error": f"{self.predicted_error:.1e} predicted, tolerance {self.tolerance:.1e}",
             "time": f"{self.predicted_seconds:.2g} s predicted",
             "moving": f"{self.reach} of {self.scene.n_particles} particles",
-            "because": "\n".join(self.reasons),
+            "because": "\n".join([*self.reasons[:3], *(["; ".join(self.reasons[3:])] if self.reasons[3:] else [])]),
             "runner-up": "; ".join(near) or "none",
         }
 

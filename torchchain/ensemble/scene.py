@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomli_w
@@ -29,6 +29,7 @@ from torchchain.network.evolvers import METHODS as NETWORK_METHODS
 from torchchain.network.lattices import BOUNDARIES as LATTICE_BOUNDARIES
 from torchchain.network.lattices import Lattice
 from torchchain.network.random_lattices import RandomLattices
+from torchchain.spelling import suggestion
 
 EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse, "standing_wave": StandingWave}
 LARGEST_CHAIN = 10**8
@@ -123,6 +124,16 @@ class Scene(Printed):
     motion: str = "vector"
     removed_bonds: float = 0.0
     position_disorder: float = 0.0
+
+    if not TYPE_CHECKING:  # type checkers know the fields
+
+        def __new__(cls, *_: Any, **given: Any) -> Scene:
+            """A misspelled field is an error that names the one most likely meant."""
+            names = [each.name for each in fields(cls)]
+            for name in given:
+                if name not in names:
+                    raise checks.FieldTypeError(f"a scene has no field {name!r}{suggestion(name, names)}")
+            return super().__new__(cls)
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from torchchain import checks
-from torchchain.chain import amplitude
+from torchchain.chain import amplitude, scaling
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.evolvers import chebyshev, damped, modes, ode, symplectic4, tridiagonal, verlet
@@ -30,6 +30,7 @@ def evolved(
     """:func:`evolve`, whose warning names the line so many calls up."""
     advance = start(chain, state, method, **options)
     amplitude.warn_if_nonlinear(chain, state, amplitude.DEVIATION_WHERE_OPEN, stacklevel=stacklevel)
+    scaling.warn_if_unscaled(chain, stacklevel)
     return advance(checks.times("times", times).to(state.displacement.device))
 
 

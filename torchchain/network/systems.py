@@ -42,6 +42,7 @@ def evolve(chain: Chain | Network, state: State, times: Any, method: str = "mode
 
     Warns:
         LinearityWarning: for linear contacts of a chain that the start would open (elongation 1, the initial overlap).
+        UnitsWarning: for masses of a chain whose mean is far from 1.
 
     >>> import torchchain as tc
     >>> chain = tc.Chain(tc.Disorder(strength=0.1).masses(16, 2, seed=0))
