@@ -43,9 +43,9 @@ class Config:
     """below this disorder the waves are shorter: in lines so narrow that few modes of the lattice lie in them, nothing decays"""
     square_scalar_weak: tuple[float, ...] = (0.145, 0.165, 0.19, 0.215, 0.245, 0.275)
     """wavelengths per spacing at weak disorder"""
-    triangular_longitudinal_weak: tuple[float, ...] = (0.0875, 0.09375, 0.1, 0.10625, 0.11875, 0.125)
+    triangular_longitudinal_weak: tuple[float, ...] = (0.1, 0.10625, 0.1125, 0.11875, 0.13125, 0.1375)
     """the same along a bond"""
-    triangular_transverse_weak: tuple[float, ...] = (0.1375, 0.15, 0.1625, 0.175, 0.19375, 0.2125)
+    triangular_transverse_weak: tuple[float, ...] = (0.175, 0.1875, 0.2, 0.2125, 0.225, 0.24375)
     """the same along a bond"""
     begin: float = 0.1
     """the slope is taken from this share of a decay time on"""
