@@ -216,6 +216,21 @@ def test_late_transfer_reaches_the_infinite_time_average():
     assert float(distance(result.mean[:, 2], result.long_time)) < 2e-3
 
 
+def test_chains_at_late_times():
+    scene = tc.Scene(
+        n_particles=32,
+        n_bands=4,
+        disorder=tc.Disorder(strength=0.2),
+        times=[500.0, 1000.0, 2000.0],
+        realizations=400,
+        seed=8,
+    )
+    measured = tc.band_transfer(scene, "modes")
+    result = theory_transfer(scene.disorder, 32, 4, scene.times)
+    noise = 0.4 * measured.stderr.sum(-1).mean(0)
+    assert bool((distance(result.mean, measured.mean) <= 0.006 + 1.5 * noise).all())
+
+
 def test_far_beyond_800_the_ladder_fades_as_it_is(monkeypatch):
     disorder, times = tc.Disorder(strength=0.3), [900.0, 2000.0]
     faded = theory_transfer(disorder, 32, 4, times).mean
