@@ -243,6 +243,9 @@ def drawn(script: Script, data: xarray.Dataset, config: Any) -> Figure:
     with plots.style():
         figure = script.draw(data, config)
         plots.legends_below(figure)
+        shown = [ax for ax in figure.axes if ax.get_subplotspec() is not None and ax.axison]  # no bars, no insets
+        if len(shown) > 1 and not any("(a)" in ax.get_title(where) for ax in shown for where in ("left", "center")):
+            plots.lettered(shown)
     return figure
 
 
