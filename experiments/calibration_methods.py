@@ -130,7 +130,7 @@ def _errors(ax: Axes, data: xarray.Dataset) -> None:
 
 def _costs(ax: Axes, data: xarray.Dataset) -> None:
     colors = _colors(data)
-    markers = dict(zip(dict.fromkeys(data.method.values), "os^vDP*X", strict=False))
+    markers = dict(zip(dict.fromkeys(data.method.values), "os^vDP*Xhd<>p8H", strict=False))
     for cost, fresh, method, model in zip(
         data.cost.values, data.fresh.values, data.method.values, data.model.values, strict=True
     ):

@@ -88,10 +88,10 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 
 def _prediction(config: Config, own: tc.BandTransfer, model: str) -> dict[str, Any]:
     """Seconds of a prediction from one start at 500 times, and its products of matrices in multiplications."""
-    method = {"memory": "projection", "compact": "logistic"}.get(model, "linear")
+    linear = {"method": "linear"} if "linear" in [fit.name for fit in tc.MODELS[model].fits] else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        master = tc.calibrate(own, method, model, bootstrap=0)
+        master = tc.calibrate(own, model=model, bootstrap=0, **linear)
         start = torch.eye(own.n_bands, dtype=torch.float64)[0]
         times = torch.linspace(0, config.stop, PREDICTED_TIMES, dtype=torch.float64)
         samples = []
@@ -109,7 +109,7 @@ def _colors(data: xarray.Dataset) -> dict[str, str]:
 
 
 def _markers(data: xarray.Dataset) -> dict[str, str]:
-    return dict(zip(dict.fromkeys(data.method.values), "os^vDP*X", strict=False))
+    return dict(zip(dict.fromkeys(data.method.values), "os^vDP*Xhd<>p8H", strict=False))
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:

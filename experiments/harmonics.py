@@ -188,7 +188,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
                 alpha=0.3,
             )
             ax.plot(data.slow_time, model[:, j], "--", color=line.get_color())
-        letter = "c" if i == 0 else "d"
+        letter = "c" if panel is axes[0, 2] else "d"
         ax.set(
             xlabel="time $\\times$ elongation$^2$", ylabel="share of the energy", yscale="log", ylim=(1e-3, 1),
             title=f"({letter}) held out, elongation {config.tests[i]:g}; dashed: triads",
