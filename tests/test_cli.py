@@ -339,8 +339,14 @@ def test_nan_devices_and_empty_words(run):
 
 
 CALIBRATE_FLAGS = [
-    ("--fit magic", "method must be one of analytic, linear, nonlinear, adam, projection, derivation, correction, logistic, got 'magic'"),
-    ("--model magic", "model must be one of paper, exact_psi, basis_matrix, swing_in, memory, theory, corrected_theory, compact, got 'magic'"),
+    (
+        "--fit magic",
+        "method must be one of analytic, linear, nonlinear, adam, projection, derivation, correction, logistic, got 'magic'",
+    ),
+    (
+        "--model magic",
+        "model must be one of paper, exact_psi, basis_matrix, swing_in, memory, theory, corrected_theory, compact, got 'magic'",
+    ),
     (
         "--fit linear --model memory",
         "model must be one of paper, exact_psi, basis_matrix, swing_in for method 'linear'",
