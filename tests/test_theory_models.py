@@ -9,6 +9,7 @@ import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.master import TheoryModel
 from torchchain.master.compact import n_coefficients
+from torchchain.master.selection import rungs
 
 F64 = torch.float64
 TIMES = torch.cat([torch.arange(0.0, 2.0, 0.25), torch.arange(2.0, 60.0, 4.0)]).double()
@@ -136,3 +137,11 @@ def test_tensors_that_make_no_model_are_refused(name, value, words):
     tensors = TheoryModel.of(SCENE).tensors() | {name: value}
     with pytest.raises((FieldError, TypeError), match=words):
         TheoryModel(**tensors)
+
+
+@pytest.mark.parametrize(("n_particles", "n_bands", "tried"), [(32, 4, False), (64, 4, False), (64, 8, True)])
+def test_selection_tries_the_theory_where_it_was_compared_with_chains(n_particles, n_bands, tried):
+    scene = tc.Scene(n_particles=n_particles, n_bands=n_bands, realizations=8, times=[0.0, 1.0, 2.0, 8.0, 20.0])
+    found = [recipe.model.name for recipe in rungs(tc.Recipe(None, None, (0.5, 2.0)), tc.band_transfer(scene))]
+    assert ("theory" in found) is tried
+    assert ("corrected_theory" in found) is tried

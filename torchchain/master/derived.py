@@ -50,6 +50,8 @@ LADDER = ((1, 1, 2), (2, 2, 4), (3, 3, 6), (4, 4, 8))
 """Degrees in place, distance and time that are tried one after the other."""
 NEAREST = 1.0
 """Distance from fresh chains over that of two ensembles, up to which it will do: as near as another ensemble would be."""
+SHORTEST, FEWEST_BANDS = 64, 8
+"""Particles and bands from which on selection tries the theory."""
 SOFT = 1e-3
 """Energies of a band below this share of its mean are taken up smoothly, so that none is negative: an ensemble's mean of
 definition "site" may be, by some 1e-4."""
@@ -281,6 +283,11 @@ def _shapes(ring: Ring, degrees: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
     return torch.stack([place[..., i] * distance[..., j] for i, j in pairs], -1), polynomials(band, degrees[0])[:, None]
 
 
+def compared(scene: Scene | None) -> bool:
+    """Whether the theory was compared with chains as long and bands as many: shorter rings have levels too few for its sums."""
+    return scene is not None and scene.n_particles >= SHORTEST and scene.n_bands >= FEWEST_BANDS
+
+
 def check_scene(scene: Scene | None) -> None:
     """Raise for chains that the theory does not hold for."""
     if scene is None:
@@ -379,13 +386,13 @@ def _rungs(n_times: int) -> list[CorrectionSettings]:
 THEORY = ReducedModel(
     "theory", "the theory of disorder: no fitted number, and no ensemble", TheoryModel,
     (Fit("derivation", "from the law of the masses", _derive),), lambda n_bands, damped, settings: 0,
-    climbed_by="derivation", needs_strength=True, fits_loss=True, check_scene=check_scene, windows=(1.0, 5.0, 50.0),
+    climbed_by="derivation", needs_strength=True, fits_loss=True, check_scene=check_scene, tried_on=compared, windows=(1.0, 5.0, 50.0),
     near=NEAREST, never_negative=True, replicas=_same,
 )  # fmt: skip
 CORRECTED = ReducedModel(
     "corrected_theory", "the theory times exponentials of polynomials: some tens of numbers, never negative", TheoryModel,
     (Fit("correction", "logistic regression on all times", _correct, settings=CorrectionSettings, report=CompactReport),),
     lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="correction",
-    needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_corrected, windows=(1.0, 5.0, 50.0),
+    needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_corrected, tried_on=compared, windows=(1.0, 5.0, 50.0),
     near=NEAREST, never_negative=True, replicas=_again,
 )  # fmt: skip

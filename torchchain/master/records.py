@@ -86,6 +86,7 @@ class ReducedModel:
         fits_loss: whether it describes the energy lost by damped chains itself; it needs no long-time average then.
         rungs: settings of ``climbed_by`` that selection tries, from the fewest fitted numbers up.
         check_scene: raises a FieldError for chains, or data without a scene (None), that it cannot describe.
+        tried_on: whether selection tries it on the chains of a scene that it describes.
         windows: ends of windows of time, in each of which selection holds it to the ensemble's error; none: on average.
         near: distance from fresh chains over that of two ensembles, up to which it will do in each window.
         never_negative: whether its energies are never negative by its form. Of damped chains, whose energies no
@@ -112,6 +113,7 @@ class ReducedModel:
     needs_strength: bool = False
     fits_loss: bool = False
     rungs: Callable[[int], Sequence[Any]] = lambda n_times: (NoSettings(),)
+    tried_on: Callable[[Scene | None], bool] = lambda scene: True
     check_scene: Callable[[Scene | None], None] = lambda scene: None
     windows: tuple[float, ...] = ()
     near: float = 1.25

@@ -34,7 +34,7 @@ def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
             continue
         if asked.model is not None:
             record.check_scene(transfer.scene)
-        elif not record.describes(transfer.scene):
+        elif not (record.describes(transfer.scene) and record.tried_on(transfer.scene)):
             continue
         fit = record.fit(record.climbed_by)
         for settings in record.rungs(len(transfer.times)):
