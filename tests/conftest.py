@@ -1,6 +1,10 @@
 """What the tests share: one thread, one look at the flags' sources, a small ensemble."""
 
+import os
 from functools import cache
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # a process for each core: threads of theirs, and of what they start, would wait for cores
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
