@@ -62,19 +62,6 @@ def family(transfer):
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the command in a folder of its own; returns exit status, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments):
-        capsys.readouterr()
-        status = cli.main([str(argument) for argument in arguments])
-        return status, *capsys.readouterr()
-
-    return command
-
-
-@pytest.fixture
 def nothing_computed(monkeypatch):
     """Where a run would begin, it stops."""
 

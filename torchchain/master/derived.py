@@ -33,7 +33,7 @@ from torchchain.master.compact import (
     power,
     terms,
 )
-from torchchain.master.compact_record import CompactReport, drawn_again
+from torchchain.master.compact_record import CompactReport, CompactSettings, drawn_again
 from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import Regression, fit_points, solve, stepped
 from torchchain.master.memory import MemoryModel
@@ -319,21 +319,6 @@ def check_corrected(scene: Scene | None) -> None:
         raise checks.fail("n_bands", "be at least 2 for model 'corrected_theory'", scene.n_bands)
 
 
-@dataclass(frozen=True)
-class CorrectionSettings:
-    """Settings of the correction.
-
-    Attributes:
-        degrees: in place, distance and time; None for the smallest that reach the ensemble's own error.
-    """
-
-    degrees: tuple[int, int, int] | None = None
-
-    def __post_init__(self) -> None:
-        if self.degrees is not None:
-            object.__setattr__(self, "degrees", checked_degrees(self.degrees))
-
-
 def _derive(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
     check_scene(sample.scene)
     assert sample.scene is not None, "checked"
@@ -378,9 +363,9 @@ def _again(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: 
         yield TheoryModel(**model.tensors() | {"coefficients": torch.from_numpy(other)})
 
 
-def _rungs(n_times: int) -> list[CorrectionSettings]:
+def _rungs(n_times: int) -> list[CompactSettings]:
     """The degrees that so many times can tell apart, the smallest at least."""
-    return [CorrectionSettings(degrees) for degrees in LADDER if degrees == LADDER[0] or 2 * degrees[2] <= n_times]
+    return [CompactSettings(degrees) for degrees in LADDER if degrees == LADDER[0] or 2 * degrees[2] <= n_times]
 
 
 THEORY = ReducedModel(
@@ -391,7 +376,7 @@ THEORY = ReducedModel(
 )  # fmt: skip
 CORRECTED = ReducedModel(
     "corrected_theory", "the theory times exponentials of polynomials: some tens of numbers, never negative", TheoryModel,
-    (Fit("correction", "logistic regression on all times", _correct, settings=CorrectionSettings, report=CompactReport),),
+    (Fit("correction", "logistic regression on all times", _correct, settings=CompactSettings, report=CompactReport),),
     lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="correction",
     needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_corrected, tried_on=compared, windows=(1.0, 5.0, 50.0),
     near=NEAREST, never_negative=True, replicas=_again,
