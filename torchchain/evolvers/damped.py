@@ -15,7 +15,7 @@ from torchchain.chain.states import State, Trajectory
 from torchchain.evolvers.method import Advance, Method
 from torchchain.modes import phase
 from torchchain.modes.motion import align_modes, modal_amplitudes
-from torchchain.modes.spectrum import normal_modes
+from torchchain.modes.spectrum import NormalModes, normal_modes
 
 
 class NearDefectiveWarning(UserWarning):
@@ -40,13 +40,19 @@ def generator(frequencies: Tensor, damping: Tensor) -> Tensor:
     return torch.cat([torch.cat([zero, w], dim=-1), torch.cat([-w, -damping], dim=-1)], dim=-2)
 
 
-def start(chain: Chain, state: State) -> Advance:
-    """See the registry entry below."""
+def undamped(chain: Chain) -> tuple[NormalModes, Tensor]:
+    """Normal modes of the chain without its damping, and the :func:`generator` of all but the rigid motion of a ring."""
     modes = normal_modes(replace(chain, damping=0.0))
     rigid = int(chain.is_free)
+    rate = chain.elongation(modes.shapes[..., rigid:].mT)
+    return modes, generator(modes.frequencies[..., rigid:], rate @ (chain.contact_damping[..., :, None] * rate.mT))
+
+
+def start(chain: Chain, state: State) -> Advance:
+    """See the registry entry below."""
+    modes, matrix = undamped(chain)
+    rigid = int(chain.is_free)
     shapes, w = modes.shapes[..., rigid:], modes.frequencies[..., rigid:]
-    rate = chain.elongation(shapes.mT)
-    matrix = generator(w, rate @ (chain.contact_damping[..., :, None] * rate.mT))
     n_modes = w.shape[-1]
 
     # The rigid motion of a periodic chain is undamped, and apart from the rest (Eq. 14's double eigenvalue 0).

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -45,7 +44,7 @@ class FrequencyBands:
     def covering(cls, chain: Chain, n_bands: int = 12) -> FrequencyBands:
         """Bands whose top lies above 98 % of the modes of linear chains like these, so that none of them is empty."""
         checks.instance("chain", chain, Chain)
-        return cls(n_bands, float(normal_modes(as_linear(chain)).frequencies.flatten().quantile(0.98)))
+        return cls(n_bands, float(normal_modes(replace(chain, contact="linear")).frequencies.flatten().quantile(0.98)))
 
     @property
     def width(self) -> float:
@@ -93,15 +92,9 @@ def frequency_band_energy(
         (True, True)
     """
     checks.instance("bands", bands, FrequencyBands)
-    modes = normal_modes(as_linear(chain)) if modes is None else modes
+    modes = normal_modes(replace(chain, contact="linear")) if modes is None else modes
     masses = chain.align(chain.masses, trajectory.displacement)
     position = change_basis(masses * trajectory.displacement, modes.shapes)
     speed = change_basis(masses * trajectory.velocity, modes.shapes)
     frequency = chain.align(modes.frequencies, position)
     return change_basis((speed.square() + (frequency * position).square()) / 2, bands.members(modes.frequencies))
-
-
-def as_linear(chain: Chain, **changes: Any) -> Chain:
-    """The chain with linear contacts of the same stiffness."""
-    settings: dict[str, Any] = {"stiffness": chain.stiffness, "damping": chain.damping, "contact": "linear"}
-    return Chain(chain.masses, boundary=chain.boundary, **settings | changes)

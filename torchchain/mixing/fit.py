@@ -74,19 +74,19 @@ def fit_triads(*data: Mixing, bootstrap: int = 20) -> TriadFit:
             raise checks.fail("data.times", "be at least 3 from 0 on", len(entry.times))
         checks.integer("data.realizations", len(entry.energies), 2)
     density = torch.stack([entry.density for entry in data]).mean(0)
-    coupling, misfit = _coupling(data, density, [torch.arange(len(entry.energies)) for entry in data])
+    unit = TriadModel(data[0].bands, density, torch.ones(len(triads_of(data[0].bands)[0])))
+    coupling, misfit = _coupling(data, unit, [torch.arange(len(entry.energies)) for entry in data])
     draw = np.random.default_rng(data[0].scene.seed)
     again = [
-        _coupling(data, density, [torch.from_numpy(draw.integers(0, n, n)) for n in (len(d.energies) for d in data)])[0]
+        _coupling(data, unit, [torch.from_numpy(draw.integers(0, n, n)) for n in (len(d.energies) for d in data)])[0]
         for _ in range(bootstrap)
     ]
     stderr = torch.stack(again).std(0) if len(again) > 1 else torch.zeros_like(coupling)
     return TriadFit(TriadModel(data[0].bands, density, coupling), stderr, misfit)
 
 
-def _coupling(data: tuple[Mixing, ...], density: Tensor, chosen: list[Tensor]) -> tuple[Tensor, float]:
-    """G and the misfit, from the chosen realizations of each measurement."""
-    unit = TriadModel(data[0].bands, density, torch.ones(len(triads_of(data[0].bands)[0])))
+def _coupling(data: tuple[Mixing, ...], unit: TriadModel, chosen: list[Tensor]) -> tuple[Tensor, float]:
+    """G and the misfit, from the chosen realizations of each measurement; ``unit`` is the model of couplings 1."""
     matrix, change = [], []
     for entry, rows in zip(data, chosen, strict=True):
         energies = entry.energies[rows]

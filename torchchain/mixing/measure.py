@@ -16,7 +16,7 @@ from torchchain.chain.chain import Chain
 from torchchain.chain.states import State
 from torchchain.ensemble.scene import Scene
 from torchchain.evolvers import evolve
-from torchchain.mixing.bands import FrequencyBands, as_linear, frequency_band_energy
+from torchchain.mixing.bands import FrequencyBands, frequency_band_energy
 from torchchain.modes.motion import change_basis
 from torchchain.modes.spectrum import NormalModes, normal_modes
 
@@ -119,7 +119,7 @@ def measure_mixing(
         numbers = list(range(first, min(first + group, scene.realizations)))
         linear = replace(scene, contact="linear", tolerance=None).chain(numbers)
         modes = normal_modes(linear)
-        hertz = as_linear(linear, contact="hertz")
+        hertz = replace(linear, contact="hertz")
         members += bands.members(modes.frequencies).sum((0, 1))
         for i, share in enumerate(shares):
             state = random_phases(linear, modes, bands, share * amplitude**2, [(scene.seed, n, i) for n in numbers])

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.chain import Chain
-from torchchain.evolvers.damped import generator
-from torchchain.modes.spectrum import normal_modes
+from torchchain.evolvers.damped import undamped
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +54,9 @@ def damped_modes(chain: Chain) -> DampedModes:
     checks.instance("chain", chain, Chain)
     if chain.contact != "linear":
         raise checks.fail("contact", "be 'linear' for modes", repr(chain.contact))
-    modes = normal_modes(replace(chain, damping=0.0))
-    rigid = int(chain.is_free)
-    shapes, frequency = modes.shapes[..., rigid:], modes.frequencies[..., rigid:]
-    rate = chain.elongation(shapes.mT)
-    matrix = generator(frequency, rate @ (chain.contact_damping[..., :, None] * rate.mT))
+    modes, matrix = undamped(chain)
     values = torch.linalg.eigvals(matrix)
-    scale = torch.finfo(matrix.dtype).eps ** 0.5 * frequency.amax(-1, keepdim=True)
+    scale = torch.finfo(matrix.dtype).eps ** 0.5 * modes.frequencies.amax(-1, keepdim=True)
     kept = values.imag > -scale  # one of each conjugate pair, and both of an overdamped motion
     kept &= ~((values.imag.abs() <= scale) & (values.real > scale))
     counts = kept.sum(-1)
