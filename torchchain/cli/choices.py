@@ -4,13 +4,14 @@ KINDS = ("normal", "uniform", "binary", "lognormal", "gamma")
 EXCITATIONS = ("impulse", "standing_wave")
 BOUNDARIES = ("periodic", "fixed")
 LATTICE_BOUNDARIES = ("periodic", "fixed", "free")
+ARRANGEMENTS = ("random", "alternating", "blocks")
 LATTICES = ("chain", "square", "triangular", "cubic", "fcc")
 CONTACTS = ("linear", "hertz", "auto")
 DEFINITIONS = ("site", "bond")
 OBSERVABLES = (
     "band_energy", "center", "displacement", "dissipated", "energy", "front", "kicked_band_energy",
     "long_time_band_energy", "openings",
-    "radial_profile", "radius", "source_energy", "spread", "total_energy", "wavenumber_energy", "width",
+    "radial_profile", "radius", "source_energy", "species_energy", "spread", "total_energy", "wavenumber_energy", "width",
 )  # fmt: skip
 METHODS = (
     "modes", "tridiagonal", "chebyshev", "verlet", "symplectic4", "damped", "dopri5", "dopri8", "bosh3",

@@ -101,6 +101,14 @@ class SceneFlags:
     """lattices: probability that a bond is missing"""
     position_disorder: Annotated[float | None, flag("FLOAT", 0.0)] = None
     """lattices: standard deviation of the coordinates of the particles, in spacings"""
+    species: Annotated[tuple[str, ...] | None, flag("'NAME: FIELD=NUMBER, ...' ...")] = None
+    """mixtures: mass, stiffness, damping and fraction of each species, or radius, density and modulus"""
+    arrangement: Annotated[str | None, flag(choices.ARRANGEMENTS, "random")] = None
+    """mixtures: order of the beads"""
+    unlike: Annotated[tuple[str, ...] | None, flag("STIFFNESS DAMPING|hertz", "springs in series")] = None
+    """mixtures: contacts between species"""
+    by_species: Annotated[bool | None, flag(("True", "False"), False)] = None
+    """mixtures: energies in bands of each species, n_bands of them in all"""
     opposite_pairs: Annotated[bool | None, flag(("True", "False"), False)] = None
     """draw chains in pairs of opposite masses: for means that change with the odd part of the disorder, such as widths"""
     plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()

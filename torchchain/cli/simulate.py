@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 from torchchain import plots
@@ -89,9 +90,21 @@ def _figure(scene: Scene, data: xarray.Dataset) -> Any:
             chosen = f"tone {tone}"
             if scene.lattices is not None:
                 chosen = f"source: band {tone}, {scene.lattices.bands(scene.n_bands).labels[tone - 1]}"
+            elif scene.by_species:
+                kind, band = divmod(tone - 1, scene.bands_each)
+                chosen = f"source: {scene.species[kind].name}, band {band + 1}"
         label = plots.label_of(values)
         if name == "band_energy":
             plots.band_map(ax, times, values.values, title=chosen)
+            if scene.by_species:
+                kinds = ", ".join(each.name for each in scene.species)
+                ax.set_ylabel(f"band $r$, {scene.bands_each} of each: {kinds}")
+        elif values.dims[-1] == "species":
+            for i, style in zip(range(values.sizes["species"]), cycle(("-", "--", ":", "-.")), strict=False):
+                each, spread = (part.isel(species=i) for part in (values, error))
+                plots.curve(ax, times, each.values, spread.values, ls=style, label=str(each.species.values))
+            ax.legend(fontsize="small")
+            ax.set(xlabel=plots.TIME_LABEL, ylabel=label, title=chosen)
         elif values.ndim == 2:
             axis = values.dims[1]
             plots.field_map(

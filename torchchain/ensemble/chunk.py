@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -77,7 +77,7 @@ class Chunk:
             with suppress(PartExceeded):  # the whole chain, then
                 return self._of_part(self.layout.part, entries)
         kinds = {entry.kernel for entry in entries}
-        if self.scene.lattice is not None:
+        if self.scene.lattice is not None or self.scene.by_species:
             return self._of_states(entries)
         if self.method == "chebyshev" and kinds == {"bands"}:
             return self._by_kernel(entries, self._bands_by_kernel)
@@ -175,12 +175,15 @@ class Chunk:
 
     def _some(self, low: int, high: int) -> Chunk:
         """Some of the realizations."""
-        chain, state, stiffness = self._chain, self.state, torch.as_tensor(self._chain.stiffness)
+        chain, state = self._chain, self.state
+        each: dict[str, Any] = {
+            entry.name: value[low:high]
+            for entry in fields(chain)
+            if entry.init and isinstance(value := getattr(chain, entry.name), Tensor) and value.ndim > 1
+        }
         return replace(
             self,
             first=self.first + low,
-            system=replace(
-                chain, masses=chain.masses[low:high], stiffness=stiffness[low:high] if stiffness.ndim > 1 else stiffness
-            ),
+            system=replace(chain, **each),
             state=State(state.displacement[low:high], state.velocity[low:high]),
         )

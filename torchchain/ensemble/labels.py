@@ -39,6 +39,8 @@ def coordinates(scene: Scene, axes: set[str]) -> dict[str, Any]:
         "band": ("band", np.arange(1, scene.n_bands + 1), {"long_name": "wavenumber band r"}),
         "wavenumber": ("wavenumber", 2 * np.pi / n * np.arange(n // 2 + 1), k),
     }
+    if scene.species:
+        every |= _of_mixtures(scene)
     if scene.lattices is not None:
         every |= _of_lattices(scene, scene.lattices)
     chosen = time_coordinates(scene.times, scene.si) if "time" in axes else {}
@@ -70,6 +72,23 @@ def _of_lattices(scene: Scene, lattices: RandomLattices) -> dict[str, Any]:
         k = {"units": "rad / particle distance", "long_name": "|q| in the middle of the shell"}
         found["shell"] = ("band", np.tile(middle, len(bands.polarizations)), k)
     return found
+
+
+def _of_mixtures(scene: Scene) -> dict[str, Any]:
+    """Coordinates that mixtures have besides, or in place of a chain's where the energies of bands are those of each species."""
+    names = np.array([each.name for each in scene.species])
+    found: dict[str, Any] = {"species": ("species", names, {"long_name": "species of the beads"})}
+    if not scene.by_species:
+        return found
+    each = scene.bands_each
+    middle = np.pi / each * (np.arange(each) + 0.5)
+    k = {"units": "rad / particle distance", "long_name": "|k| in the middle of the band"}
+    return found | {
+        "tone": ("tone", np.array(scene.tones, dtype=np.int64), {"long_name": "band whose wave starts"}),
+        "band": ("band", np.arange(1, scene.n_bands + 1), {"long_name": "band r: species and |k|"}),
+        "band_species": ("band", names.repeat(each), {"long_name": "species"}),
+        "band_wavenumber": ("band", np.tile(middle, len(names)), k),
+    }
 
 
 def scene_attributes(scene: Scene) -> dict[str, Any]:

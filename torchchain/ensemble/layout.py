@@ -69,7 +69,7 @@ def layout(scene: Scene, method: str, device: torch.device) -> Layout:
     Raises:
         FieldError: if one realization at a time takes more memory than there is.
     """
-    fused = device.type == "cpu" and scene.lattice is None and is_fused(method, scene.observables)
+    fused = device.type == "cpu" and is_fused(method, scene)
     part = moving_part(scene, method)
     cut = scene if part is None or fused else part.scene(scene)
     one = replace(footprint.footprint(cut, method, fused), results=footprint.footprint(scene, method, fused).results)

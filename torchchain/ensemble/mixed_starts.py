@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -71,11 +72,15 @@ def fit_transfer(starts: Tensor, energies: Tensor, realization: Tensor) -> Fitte
         kept = ~torch.isin(realization, part)
         _check_left(starts, kept, realization)
         left_out.append(_solved(starts[kept], energies[kept]))
-    replicates = torch.stack(left_out)
+    return _jackknife(mean, torch.stack(left_out), tuple(len(part) for part in parts), condition)
+
+
+def _jackknife(mean: Tensor, replicates: Tensor, counts: tuple[int, ...], condition: float) -> FittedTransfer:
+    """The transfer with the error and the pseudo-values of those without one block each."""
+    blocks = len(counts)
     spread = (replicates - replicates.mean(0)).square().sum(0)
     stderr = (spread * (blocks - 1) / blocks).sqrt()
-    pseudo = blocks * mean - (blocks - 1) * replicates
-    return FittedTransfer(mean, stderr, pseudo, tuple(len(part) for part in parts), condition)
+    return FittedTransfer(mean, stderr, blocks * mean - (blocks - 1) * replicates, counts, condition)
 
 
 def _check_left(starts: Tensor, kept: Tensor, realization: Tensor) -> None:
@@ -120,3 +125,32 @@ def _solved(starts: Tensor, energies: Tensor) -> Tensor:
     flat = energies.reshape(len(energies), -1)
     solution = torch.linalg.lstsq(starts, flat, driver="gelsd").solution
     return solution.reshape(starts.shape[1], *energies.shape[1:])
+
+
+def unmixed(block_mean: Tensor, block_counts: Sequence[int]) -> FittedTransfer:
+    """The transfer T of runs that every realization makes alike, from their mean energies: E(run, t) = sum_s E(run, s, 0) T(s, t).
+
+    Energies add up on average, so that the means over the realizations are enough.
+
+    Args:
+        block_mean: E of blocks of realizations, [block, run, time, band], as many runs as bands, the first time being 0.
+        block_counts: realizations of each.
+
+    Returns:
+        FittedTransfer, its errors by leaving out one block at a time.
+
+    Raises:
+        FieldError: if the runs do not tell the bands apart.
+    """
+    counts = torch.tensor(block_counts, dtype=block_mean.dtype)[:, None, None, None]
+    total = (counts * block_mean).sum(0)
+
+    def solved(energies: Tensor) -> Tensor:
+        return torch.linalg.solve(energies[:, 0], energies.flatten(1)).reshape(energies.shape)
+
+    condition = condition_of(total[:, 0])
+    mean, blocks = solved(total), len(counts)
+    if blocks < 2:
+        return FittedTransfer(mean, torch.full_like(mean, torch.inf), mean[None], tuple(block_counts), condition)
+    replicates = torch.stack([solved(total - part) for part in counts * block_mean])
+    return _jackknife(mean, replicates, tuple(block_counts), condition)

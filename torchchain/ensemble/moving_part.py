@@ -120,14 +120,15 @@ def moving_part(scene: Scene, method: str | None = None) -> MovingPart | None:
         first, last = max(0, first), min(n, last)
     elif first < 0 or last >= n:  # a ring's contact 0 lies at its seam
         return None
-    fused = method is not None and is_fused(method, scene.observables)
+    fused = method is not None and is_fused(method, scene)
     worthwhile = WORTHWHILE_FUSED if fused else WORTHWHILE
     return MovingPart(first, last, n) if last - first < worthwhile * n else None
 
 
 def _front_speed(scene: Scene) -> float:
     """A speed that fronts stay below: 1 on average masses and contacts, more for disorder and for large amplitudes."""
+    fastest = 1.0 if scene.mixture is None else max(1.0, scene.mixture.fastest)
     xi = scene.disorder.strength + (scene.stiffness_disorder.strength if scene.stiffness_disorder else 0.0)
     amplitude = abs(scene.excitation.velocity) if isinstance(scene.excitation, Impulse) else 0.0
     compressed = (1 + 2 * amplitude) ** 0.25 if scene.contact == "hertz" else 1.0
-    return (1 + 0.3 * xi) * compressed
+    return (1 + 0.3 * xi) * compressed * fastest

@@ -19,12 +19,14 @@ from torchchain.network import energy as spreading
 from torchchain.network import systems
 from torchchain.network.lattices import Lattice
 from torchchain.network.trajectories import NetworkTrajectory
+from torchchain.species.energy import species_band_energy, species_energy
+from torchchain.species.mixtures import MixedChain
 
 if TYPE_CHECKING:
     from torchchain.ensemble.scene import Scene
 
-AXES = ("time", "particle", "wavenumber", "band", "ring")
-CHAINS, LATTICES = ("chain",), ("lattice",)
+AXES = ("time", "particle", "wavenumber", "band", "ring", "species")
+CHAINS, LATTICES, MIXTURES = ("chain",), ("lattice",), ("mixture",)
 KERNELS = ("bands", "total", "center", "width")
 
 
@@ -47,7 +49,7 @@ class Observable:
         passes: elementwise passes over a state that computing it takes, for the plan's estimate of time.
         kernel: what the stencil's kernels measure it as without storing states: "bands", or "total", "center" or
             "width" of the energy, which come together.
-        kinds: of scenes that have it: of a "chain", of a "lattice".
+        kinds: of scenes that have it: of a "chain", of a "lattice", of a "mixture" of species.
 
     Example:
         >>> speed = tc.Observable("speed", ("time",), "initial overlap / time", "largest speed",
@@ -114,9 +116,14 @@ def _openings(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
 
 def _band_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
     """Share of the energy, of that at the start where damping takes some of it."""
-    share = systems.band_energy(chain, trajectory, scene.n_bands, scene.damping == 0, _of_wavenumbers(scene))
-    if scene.damping == 0:
-        return share
+    if scene.by_species:
+        mixed, labels, count = _of_species(scene, chain)
+        each = species_band_energy(mixed, trajectory, labels, count, scene.bands_each)
+        share = each.flatten(-2)
+    else:
+        share = systems.band_energy(chain, trajectory, scene.n_bands, scene.largest_damping == 0, _of_wavenumbers(scene))
+        if scene.largest_damping == 0:
+            return share
     return share / systems.total_energy(chain, _start(scene, chain, trajectory))[..., None]
 
 
@@ -143,6 +150,18 @@ def _long_time_band_energy(scene: Scene, chain: System, state: State, modes: Any
 def _of_wavenumbers(scene: Scene) -> str:
     """The definition of energies over wavenumbers; lattices have one."""
     return scene.energy_definition if scene.lattice is None else "site"
+
+
+def _of_species(scene: Scene, chain: System) -> tuple[MixedChain, Tensor, int]:
+    """The chain, the species of its beads, and how many there are."""
+    assert isinstance(chain, MixedChain), "of mixtures"
+    assert chain.labels is not None, "drawn with them"
+    return chain, chain.labels, len(scene.species)
+
+
+def _species_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
+    mixed, labels, count = _of_species(scene, chain)
+    return species_energy(mixed, trajectory, labels, count, scene.energy_definition)
 
 
 def _profile(scene: Scene, network: Lattice, trajectory: Trajectory) -> Tensor:
@@ -218,6 +237,10 @@ for _one in (
         "source_energy", ("time",), _JOULE, "energy of the source particle", _source_energy, local=True, passes=14
     ),
     Observable(
+        "species_energy", ("time", "species"), _JOULE, "energy of each species",
+        _species_energy, passes=20, kinds=MIXTURES,
+    ),
+    Observable(
         "spread", ("time",), "particle distance^2", "mean squared distance r^2 of the energy from the source",
         lambda s, c, t: spreading.energy_spread(c, _energy(s, c, t), s.site), kinds=LATTICES,
     ),
@@ -242,7 +265,7 @@ def chosen_observables(names: Sequence[str]) -> list[Observable]:
     return [OBSERVABLES[name] for name in names]
 
 
-def is_fused(method: str, names: Sequence[str]) -> bool:
-    """Whether the stencil's kernels measure all that is measured in time: the bands, or totals, centers and widths."""
-    kinds = {entry.kernel for entry in chosen_observables(names) if entry.in_time}
-    return method == "chebyshev" and (kinds == {"bands"} or kinds <= {"total", "center", "width"})
+def is_fused(method: str, scene: Scene) -> bool:
+    """Whether the stencil's kernels measure all that is measured in time: the bands of all beads, or totals, centers and widths."""
+    kinds = {entry.kernel for entry in chosen_observables(scene.observables) if entry.in_time}
+    return method == "chebyshev" and scene.lattice is None and not scene.by_species and (kinds == {"bands"} or kinds <= {"total", "center", "width"})

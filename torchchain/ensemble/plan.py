@@ -303,7 +303,7 @@ def _can(name: str, scene: Scene) -> bool:
     """Whether the plan weighs the method for the scene."""
     entry = scene.methods[name]
     fits = entry.candidate and scene.boundary in (*entry.boundaries, "free") and scene.contact in entry.contacts
-    if scene.damping > 0:
+    if scene.largest_damping > 0:
         return fits and entry.damped
     if "rtol" in entry.options and scene.contact == "linear":
         return False  # the other methods are exact there

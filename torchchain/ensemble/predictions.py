@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -48,8 +49,10 @@ class Facts:
         bounds = chain.squared_frequency_bound(sweeps=8).sqrt()
         few = max(1, SAMPLE // (self.rows * self.n))
         few = min(few, sampled)
-        stiffness = chain.contact_stiffness[:few]
-        self._linear = Chain(chain.masses[:few], inner.boundary, stiffness)
+        if self.part is None:
+            self._linear: Chain = replace(scene.chain(range(few)), contact="linear", damping=0.0)
+        else:
+            self._linear = Chain(chain.masses[:few], inner.boundary, chain.contact_stiffness[:few])
         self._state = inner.state(self._linear)
         self.elongation = float(elongation_estimate(self._linear, self._state).max())
         self.deviation = float(force_deviation(torch.tensor(self.elongation, dtype=torch.float64)))
@@ -109,7 +112,7 @@ class Facts:
     @property
     def growing(self) -> float:
         """The time over which phase errors grow: damping ends that of the fast modes."""
-        return self.end if self.scene.damping == 0 else min(self.end, 1 / self.scene.damping)
+        return self.end if self.scene.largest_damping == 0 else min(self.end, 1 / self.scene.largest_damping)
 
     @property
     def bands_alone(self) -> bool:
@@ -180,8 +183,8 @@ def settle(
     elif entry.order_in_step is not None:
         step = (0.9 * tolerance / _step_error(entry, facts)) ** (1 / entry.order_in_step)
         step = min(step, 0.7 * (entry.stability_limit or math.inf) / facts.limit)
-        if facts.scene.damping > 0:
-            step = min(step, 0.7 / (facts.scene.damping * facts.limit**2))
+        if facts.scene.largest_damping > 0:
+            step = min(step, 0.7 / (facts.scene.largest_damping * facts.limit**2))
         options = {"step": min(step, facts.end or 1.0)}
     return options, error_of(method, facts, options, dtype)
 
@@ -207,7 +210,7 @@ def _step_error(entry: Method, facts: Facts) -> float:
     Energies are off by twice what phases are, and the largest error of a field is larger than its mean.
     """
     assert entry.order_in_step is not None
-    if facts.scene.observables == ("total_energy",) and facts.scene.damping == 0:
+    if facts.scene.observables == ("total_energy",) and facts.scene.largest_damping == 0:
         swing = 6 * entry.phase_error if math.isnan(entry.energy_error) else entry.energy_error
         return 3 * swing * facts.frequency(entry.order_in_step // 2) ** 2  # modes' energies add, with their weights
     margin = 5 if "displacement" in facts.scene.observables else 3
@@ -293,7 +296,7 @@ def _steps(entry: Method, facts: Facts, step: float, dtype: torch.dtype) -> floa
     count = float((facts.gaps / step * (1 - 1e-9)).ceil().sum())
     update = UPDATE[facts.scene.contact][dtype == torch.float32]
     work = count * entry.forces_per_step * (facts.n * update + LOOP)
-    if facts.scene.damping > 0:
+    if facts.scene.largest_damping > 0:
         work += count * (facts.n * DAMP + LOOP)
     return facts.rows * (work + len(facts.gaps) * facts.n * 4 * PASS) + _observing(facts)
 
@@ -303,7 +306,7 @@ def _chebyshev(facts: Facts, accuracy: float) -> float:
     gaps, points = facts.gaps[facts.gaps > 0], facts.rows * len(facts.gaps)
     z = facts.typical * (gaps[:1] if facts.uniform else gaps)  # one stands for all that are equal
     repeats = len(gaps) if facts.uniform else 1
-    fused = is_fused("chebyshev", facts.scene.observables)
+    fused = is_fused("chebyshev", facts.scene)
     stencils = sums = orders = 0.0
     longest = 4.0
     for phase in z.tolist():

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import tomli_w
@@ -29,14 +29,19 @@ from torchchain.network.evolvers import METHODS as NETWORK_METHODS
 from torchchain.network.lattices import BOUNDARIES as LATTICE_BOUNDARIES
 from torchchain.network.lattices import Lattice
 from torchchain.network.random_lattices import RandomLattices
+from torchchain.species.energy import species_waves
+from torchchain.species.mixtures import MixedChain, Mixture, Species
 from torchchain.spelling import suggestion
 
+System = TypeVar("System", Lattice, MixedChain)
 EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse, "standing_wave": StandingWave}
 LARGEST_CHAIN = 10**8
 MOST_TIMES = 10**7
 LATEST_TIME = 1e12
 OF_LATTICES = {"shape": None, "motion": "vector", "removed_bonds": 0.0, "position_disorder": 0.0}
 """Fields that lattices alone have, with their defaults."""
+OF_MIXTURES = {"species": (), "arrangement": "random", "unlike": None, "by_species": False}
+"""Fields that mixtures of species alone have, with their defaults."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,6 +67,11 @@ class Scene(Printed):
     removed_bonds,
     position_disorder
     ==================  ===============================================  =================================================
+
+    With ``species`` the chains are mixtures. By default their bands are those of any chain, of the energy of all beads; with
+    ``by_species`` those of every species by itself: ``n_bands`` counts bands of k times species, those of the first species
+    first, energies are by "bond" (:func:`torchchain.species.species_band_energy`), and ``tones`` are bands whose wave starts,
+    one of velocity on the beads of the species alone.
 
     >>> import torchchain as tc
     >>> scene = tc.Scene(lattice="triangular", shape=(12, 12), n_bands=8, disorder=tc.Disorder(strength=0.2), times=[0, 5])
@@ -93,6 +103,10 @@ class Scene(Printed):
         motion: of lattices, "vector" or "scalar".
         removed_bonds: probability that a bond of the lattice is missing.
         position_disorder: standard deviation of the coordinates of the lattice's particles, in spacings.
+        species: of a mixture, each a :class:`torchchain.species.Species` or its table; ``disorder`` is then of the masses
+            within each, a factor of mean 1, and ``damping`` that of the species.
+        arrangement, unlike: of the species and of contacts between them, see :class:`torchchain.species.Mixture`.
+        by_species: whether energies in bands are those of every species.
 
     Raises:
         FieldError, FieldTypeError: one line with the field, the rule and the value.
@@ -124,6 +138,10 @@ class Scene(Printed):
     motion: str = "vector"
     removed_bonds: float = 0.0
     position_disorder: float = 0.0
+    species: tuple[Species, ...] = ()
+    arrangement: str = "random"
+    unlike: tuple[float, float] | str | None = None
+    by_species: bool = False
 
     if not TYPE_CHECKING:  # type checkers know the fields
 
@@ -140,15 +158,19 @@ class Scene(Printed):
             object.__setattr__(self, name, value)
 
         if self.lattice is None:
-            for name, default in OF_LATTICES.items():
-                value = getattr(self, name)
-                if not (value is default or (isinstance(value, (str, int, float)) and value == default)):
-                    raise checks.fail(name, "be left out without a lattice", checks.shown(value))
+            self._left_out(OF_LATTICES, "a lattice")
             put("n_particles", 256 if self.n_particles is None else self.n_particles)
             put("n_bands", 32 if self.n_bands is None else self.n_bands)
         else:
             self._check_lattice(put)
         put("n_particles", checks.integer("n_particles", self.n_particles, 2, LARGEST_CHAIN))
+        if not isinstance(self.species, (list, tuple)):
+            raise checks.FieldTypeError(f"species must be a list of species, got {checks.shown(self.species)}")
+        put("species", tuple(Species.of(each) for each in self.species))
+        if self.species:
+            self._check_mixture(put)
+        else:
+            self._left_out(OF_MIXTURES, "species")
         checks.choice("boundary", self.boundary, BOUNDARIES if self.lattice is None else LATTICE_BOUNDARIES)
         put("realizations", checks.integer("realizations", self.realizations, 1, 10**9))
         put("seed", checks.integer("seed", self.seed, 0, 2**64 - 1))
@@ -178,21 +200,27 @@ class Scene(Printed):
         if self.needs_bands and self.lattices is not None:
             self.lattices.bands(self.n_bands)
         elif self.needs_bands:
-            check_bands(self.n_particles, self.n_bands)
-            if isinstance(self.excitation, StandingWave):  # the center tone of the last band can be N/2
+            check_bands(self.n_particles, self.bands_each)
+            if isinstance(self.excitation, StandingWave) and self.by_species:
+                wave = dataclasses.replace(self.excitation, tones=center_tones(self.n_particles, self.bands_each))
+                wave.check(self.n_particles)
+            elif isinstance(self.excitation, StandingWave):  # the center tone of the last band can be N/2
                 dataclasses.replace(self.excitation, tones=self.tones).check(self.n_particles)
         for entry in chosen_observables(self.observables):
             of = f"for the observable {entry.name}"
-            if self.kind not in entry.kinds:
-                several = ", ".join(n for n, o in OBSERVABLES.items() if self.kind in o.kinds)
+            own = {self.kind, "mixture"} if self.species else {self.kind}
+            if not own & set(entry.kinds):
+                several = ", ".join(n for n, o in OBSERVABLES.items() if own & set(o.kinds))
                 raise checks.fail("observables", f"be of {self.kind}s ({several})", repr(entry.name))
+            if entry.wavenumbers and self.by_species and entry.name != "band_energy":
+                raise checks.fail("by_species", f"be False {of}", True)
             if entry.wavenumbers and self.contact == "hertz":
                 raise checks.fail("contact", f"be 'linear' {of}", repr(self.contact))
             if entry.wavenumbers and self.energy_definition == "bond" and self.boundary == "fixed" and not self.lattice:
                 raise checks.fail("boundary", f"be 'periodic' {of} by 'bond'", repr(self.boundary))
-            if not entry.damped and self.damping > 0:
-                raise checks.fail("damping", f"be zero {of}", self.damping)
-        if (self.contact == "hertz" or self.lattice) and self.energy_definition == "site":
+            if not entry.damped and self.largest_damping > 0:
+                raise checks.fail("damping", f"be zero {of}", self.largest_damping)
+        if (self.contact == "hertz" or self.lattice or self.by_species) and self.energy_definition == "site":
             put("energy_definition", "bond")  # the only one that a Hertz contact has; that of lattices in space
 
     def _check_lattice(self, put: Callable[[str, Any], None]) -> None:
@@ -226,8 +254,53 @@ class Scene(Printed):
         if self.n_bands is None:
             put("n_bands", lattices.default_bands)
 
+    def _left_out(self, defaults: dict[str, Any], of: str) -> None:
+        """An error for fields of what the scene is not of."""
+        for name, default in defaults.items():
+            value = getattr(self, name)
+            if not (value is default or (isinstance(value, (str, int, float)) and value == default)):
+                raise checks.fail(name, f"be left out without {of}", checks.shown(value))
+
+    def _check_mixture(self, put: Callable[[str, Any], None]) -> None:
+        """Checks what mixtures have of their own."""
+        if isinstance(self.unlike, list):
+            put("unlike", tuple(self.unlike))
+        mixture = self.mixture
+        assert mixture is not None, "of species"
+        put("unlike", mixture.unlike)
+        if self.lattice is not None:
+            raise checks.fail("species", "be left out for a lattice", [each.name for each in self.species])
+        for name, wanted in (("damping", 0.0), ("si", None), ("opposite_pairs", False)):
+            value = getattr(self, name)
+            if value is not wanted and value != wanted:
+                rule = "be that of the species" if name == "damping" else "be left out for a mixture"
+                raise checks.fail(name, rule, checks.shown(value))
+        checks.truth("by_species", self.by_species)
+        if not self.by_species:
+            return
+        if checks.integer("n_bands", self.n_bands, 1) % len(self.species):
+            raise checks.fail("n_bands", f"be a multiple of the {len(self.species)} species", self.n_bands)
+        for name, needed in (("boundary", "periodic"), ("contact", "linear")):
+            if getattr(self, name) != needed:
+                raise checks.fail(name, f"be {needed!r} for by_species", repr(getattr(self, name)))
+
+    @cached_property
+    def mixture(self) -> Mixture | None:
+        """What the beads of the scene are of; None for beads of one kind."""
+        return Mixture(self.species, self.arrangement, self.unlike) if self.species else None
+
+    @property
+    def bands_each(self) -> int:
+        """Bands of k: as many of every species where energies are those of each, else ``n_bands``."""
+        return self.n_bands // len(self.species) if self.by_species else self.n_bands
+
+    @property
+    def largest_damping(self) -> float:
+        """Damping of the contacts, of a mixture the largest; 0 where none is damped."""
+        return self.damping if self.mixture is None else self.mixture.largest_damping
+
     def _check_excitation(self) -> None:
-        if self.lattice is None or isinstance(self.excitation, Impulse):
+        if (self.lattice is None and not self.by_species) or isinstance(self.excitation, Impulse):
             self.excitation.check(self.n_particles)
             return
         for tone in self.excitation.tones or ():
@@ -268,6 +341,7 @@ class Scene(Printed):
         """Of the axes that results can have."""
         n = self.n_particles
         found = {"time": len(self.times), "particle": n, "wavenumber": n // 2 + 1, "band": self.n_bands}
+        found["species"] = len(self.species)
         return found if self.lattices is None else found | {"ring": len(self.lattices.ring_edges(self.site)) - 1}
 
     def _rows(self) -> dict[str, str]:
@@ -278,12 +352,14 @@ class Scene(Printed):
         wave = f"impulse: {words(self.excitation)}"
         if isinstance(self.excitation, StandingWave):
             wave = f"{_listed(self.tones, 'tone', 'tones')} of a standing wave: {words(self.excitation)}"
-        contacts = f"{self.contact}, damping {self.damping:g}"
+        contacts = f"{self.contact}, damping {self.largest_damping:g}"
         size = f"{self.boundary}, of {self.n_particles} particles"
         if self.lattice is not None:
             wave = wave.replace("tone", "band").replace("a standing wave", "plane waves")
             contacts += f", {self.removed_bonds:g} of the bonds removed" if self.removed_bonds else ""
             size = f"{_shape(self)} {self.lattice}, motion '{self.motion}', {self.boundary}"
+        if self.species:
+            size += f", of {', '.join(each.name for each in self.species)} ({self.arrangement})"
         if self.stiffness_disorder is not None:
             contacts += f", stiffness disorder: {words(self.stiffness_disorder)}"
         pairs = " in opposite pairs" if self.sample_size == 2 else ""
@@ -310,6 +386,8 @@ class Scene(Printed):
         """Whether every realization is the same chain or lattice."""
         if self.lattices is not None:
             return self.lattices.is_ordered
+        if self.mixture is not None and not self.mixture.is_ordered:
+            return False
         return self.disorder.strength == 0 and (
             self.stiffness_disorder is None or self.stiffness_disorder.strength == 0
         )
@@ -329,14 +407,14 @@ class Scene(Printed):
         """The tones of the standing waves, counted from 1; of lattices, bands; empty for an impulse."""
         if isinstance(self.excitation, Impulse):
             return ()
-        if self.lattice is not None:
+        if self.lattice is not None or self.by_species:
             return self.excitation.tones or tuple(range(1, self.n_bands + 1))
         return self.excitation.tones or center_tones(self.n_particles, self.n_bands)
 
     @property
     def source_bands(self) -> list[int]:
         """The band, counted from 1, that holds each of the tones."""
-        if self.lattice is not None:
+        if self.lattice is not None or self.by_species:
             return list(self.tones)
         return [band_of(tone, self.n_particles, self.n_bands) for tone in self.tones]
 
@@ -351,6 +429,8 @@ class Scene(Printed):
         if self.lattice is not None:
             raise checks.fail("lattice", "be None for chains (scene.system gives either)", repr(self.lattice))
         numbers = list(realizations)
+        if self.mixture is not None:
+            return self._mixed(self.mixture, numbers, device, dtype)
         masses = self.disorder.masses(self.n_particles, numbers, self.seed, self.opposite_pairs)
         stiffness: float | Tensor = 1.0
         if self.stiffness_disorder is not None:
@@ -359,6 +439,15 @@ class Scene(Printed):
                 device, dtype
             )
         return Chain(masses.to(device, dtype), self.boundary, stiffness, self.contact, self.damping)
+
+    def _mixed(
+        self, mixture: Mixture, numbers: list[int], device: torch.device | str, dtype: torch.dtype
+    ) -> MixedChain:
+        made = mixture.chain(self.n_particles, numbers, self.seed, self.boundary, self.contact, self.disorder)
+        if self.stiffness_disorder is not None:
+            factor = self.stiffness_disorder.stiffnesses(made.n_contacts, numbers, self.seed)
+            made = dataclasses.replace(made, stiffness=made.contact_stiffness * factor)
+        return _moved(made, device, dtype)
 
     def system(
         self, realizations: Iterable[int], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
@@ -379,6 +468,9 @@ class Scene(Printed):
             return self.lattices.waves(chain, self.n_bands, self.tones, wave.amplitude, wave.phase)
         if isinstance(self.excitation, Impulse):
             return self.excitation.state(chain)
+        if self.by_species:
+            assert isinstance(chain, MixedChain), "chains of a mixture"
+            return species_waves(chain, self.excitation, self.bands_each, self.tones)
         return dataclasses.replace(self.excitation, tones=self.tones).state(chain)
 
     def to_dict(self) -> dict[str, Any]:
@@ -388,6 +480,8 @@ class Scene(Printed):
             value = getattr(self, entry.name)
             if entry.name in ("n_particles", "energy_definition") if self.lattice else entry.name in OF_LATTICES:
                 continue  # of a lattice they follow, a chain has them not
+            if entry.name in OF_MIXTURES and not self.species:
+                continue
             if entry.name == "times":
                 value = _times_table(value)
             elif entry.name == "excitation":
@@ -396,7 +490,7 @@ class Scene(Printed):
             elif isinstance(value, (Disorder, Scaling)):
                 value = _plain(value)
             elif isinstance(value, tuple):
-                value = list(value)
+                value = [_plain(each) if isinstance(each, Species) else each for each in value]
             if value is not None:
                 plain[entry.name] = value
         return plain
@@ -431,6 +525,8 @@ class Scene(Printed):
         for name in ("observables", "shape"):
             if isinstance(fields.get(name), list):
                 fields[name] = tuple(fields[name])
+        if isinstance(fields.get("unlike"), Sequence) and not isinstance(fields["unlike"], str):
+            fields["unlike"] = _unlike(fields["unlike"])
         return cls(**fields)
 
     @classmethod
@@ -552,8 +648,18 @@ def _shape(scene: Scene) -> str:
     return " x ".join(map(str, scene.shape or ()))
 
 
-def _moved(network: Lattice, device: torch.device | str, dtype: torch.dtype) -> Lattice:
-    """The lattices on another device, in another precision."""
+def _unlike(given: Sequence[Any]) -> Any:
+    """The contacts between species of a scene file, or the words of a flag: two numbers, or the name of a law."""
+    if len(given) == 1:
+        return given[0]
+    try:
+        return tuple(float(each) if isinstance(each, str) else each for each in given)
+    except ValueError:
+        raise checks.fail("unlike", "be a stiffness and a damping, or 'hertz'", list(given)) from None
+
+
+def _moved(network: System, device: torch.device | str, dtype: torch.dtype) -> System:
+    """The lattices or chains on another device, in another precision."""
     values: dict[str, Any] = {
         entry.name: value.to(device, dtype if value.is_floating_point() else None)
         for entry in dataclasses.fields(network)
@@ -572,6 +678,8 @@ def describe(scene: Scene) -> str:
     end = np.format_float_positional(float(scene.times[-1]), trim="-")
     pairs = " in opposite pairs" if scene.sample_size == 2 else ""
     what = f"{scene.boundary} chains{pairs}, N = {scene.n_particles}"
+    if scene.species:
+        what += f" of {' and '.join(each.name for each in scene.species)}"
     if scene.lattice is not None:
         wave = wave.replace("standing", "plane")
         what = f"{scene.boundary} {scene.lattice} lattices{pairs}, {_shape(scene)}, {scene.motion}"

@@ -136,7 +136,7 @@ def start_times(times: Tensor) -> Tensor:
 
 def measurable(scene: Scene) -> bool:
     """Whether other starts of a scene are measured: of undamped, linear rings, in which the energy is quadratic, of enough samples."""
-    linear = scene.lattice is None and scene.contact == "linear" and scene.damping == 0 and scene.boundary == "periodic"
+    linear = scene.lattice is None and not scene.species and scene.contact == "linear" and scene.damping == 0 and scene.boundary == "periodic"
     linear = linear and scene.energy_definition == "site"  # by bonds a kick has spread over wavenumbers at once
     return linear and scene.distinct_realizations // scene.sample_size >= FEWEST
 

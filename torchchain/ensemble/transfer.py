@@ -27,7 +27,7 @@ from torchchain.ensemble.checkpoint import Checkpoint
 from torchchain.ensemble.imported import as_shares, gathered
 from torchchain.ensemble.labels import ordered_error, scene_attributes, time_coordinates
 from torchchain.ensemble.layout import BLOCKS
-from torchchain.ensemble.mixed_starts import fit_transfer
+from torchchain.ensemble.mixed_starts import fit_transfer, unmixed
 from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.ranks import ALONE, Ranks
 from torchchain.ensemble.run import ensemble_moments
@@ -170,7 +170,7 @@ class BandTransfer(Printed):
     @property
     def damping(self) -> float:
         """Contact damping; 0 for data from elsewhere, whose shares of the energy are of that at each time."""
-        return 0.0 if self.scene is None else self.scene.damping
+        return 0.0 if self.scene is None else self.scene.largest_damping
 
     @property
     def is_ordered(self) -> bool:
@@ -295,7 +295,7 @@ class BandTransfer(Printed):
                 raise checks.fail(
                     "data", f"hold the variable {name} of a band transfer", f"{', '.join(map(str, data))}"
                 )
-        attributes = {name: data.attrs[name] for name in ("method", "method_options") if name in data.attrs}
+        attributes = {name: data.attrs[name] for name in ("method", "method_options", "start_condition") if name in data.attrs}
         scene = None
         if "scene" in data.attrs or "provenance_kind" not in data.attrs:
             scene, moments = _scene_of(data)
@@ -663,8 +663,8 @@ def band_transfer(
     if isinstance(method, str) and method == THEORY:
         checks.known_keys("options of method 'theory'", options or {}, ())
         with stages("theory"):
-            return _from_theory(scene, long_time and scene.damping == 0)
-    long_time = long_time and scene.damping == 0
+            return _from_theory(scene, long_time and scene.largest_damping == 0)
+    long_time = long_time and scene.largest_damping == 0
     observables = measured_observables(scene, long_time)
     settings: dict[str, Any] = {
         "device": device, "memory_budget": memory_budget, "progress": progress, "stages": stages, "ranks": ranks,
@@ -677,6 +677,7 @@ def band_transfer(
     )  # fmt: skip
     with single_thread(), stages("statistics"):
         found = _from_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None)
+        found = _by_species(found, ensemble.moments) if scene.by_species else found
         found = with_late_average(found) if long_time and len(observables) == 1 else found
     if not starts or not measurable(scene):
         return found
@@ -684,10 +685,26 @@ def band_transfer(
     return replace(found, starts=start_transfer(scene, ensemble.method, ensemble.options, other, **settings))
 
 
+def _by_species(transfer: BandTransfer, moments: EnsembleMoments) -> BandTransfer:
+    """The transfer between the species' bands, from runs whose waves are seen in several of them at the start."""
+    if float(transfer.times[0]) != 0:
+        raise checks.fail("times", "begin at 0 for the transfer between species", float(transfer.times[0]))
+    blocks = moments.blocks("band_energy")
+    try:
+        found = unmixed(torch.stack([block.mean for block in blocks]), [block.count for block in blocks])
+    except checks.FieldError as error:
+        rule = "tell k from pi - k for the transfer between species (random or blocks, with species mixed enough)"
+        raise checks.fail("arrangement", rule, str(error)) from None
+    stderr = torch.zeros_like(found.stderr) if transfer.is_ordered else found.stderr
+    block_mean, stderr = rounded(found.block_mean, found.mean, stderr, found.block_counts)
+    attributes = transfer.attributes | {"start_condition": found.condition}
+    return replace(transfer, mean=found.mean, stderr=stderr, block_mean=block_mean, attributes=attributes)
+
+
 def measured_observables(scene: Scene, long_time: bool = True) -> tuple[str, ...]:
     """What is measured on every realization of a band transfer: of large lattices no long-time average, which takes all modes."""
     exact = scene.lattice is None or scene.n_particles * scene.n_components <= MOST_UNKNOWNS
-    return ("band_energy", *(("long_time_band_energy",) if long_time and exact and scene.damping == 0 else ()))
+    return ("band_energy", *(("long_time_band_energy",) if long_time and exact and not scene.by_species and scene.largest_damping == 0 else ()))
 
 
 def with_late_average(transfer: BandTransfer) -> BandTransfer:
@@ -711,6 +728,8 @@ def _from_theory(scene: Scene, long_time: bool) -> BandTransfer:
     """The transfer of the scene's law of disorder, without chains; its realizations do not matter."""
     if scene.lattice is not None:
         return _from_lattice_theory(scene)
+    if scene.species:
+        raise checks.fail("species", "be left out for method 'theory'", [each.name for each in scene.species])
     if scene.energy_definition != "site":
         raise checks.fail("energy_definition", "be 'site' for method 'theory'", repr(scene.energy_definition))
     found = theory_transfer(

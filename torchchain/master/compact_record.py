@@ -66,6 +66,8 @@ def check_scene(scene: Scene | None) -> None:
         raise checks.fail("transfer", "be of chains of a scene for model 'compact'", "energies without one")
     if scene.lattice is not None:
         raise checks.fail("lattice", "be none for model 'compact'", scene.lattice)
+    if scene.species:
+        raise checks.fail("species", "be left out for model 'compact'", [each.name for each in scene.species])
     if not scene.disorder.strength > 0:
         raise checks.fail("disorder.strength", "be above 0 for model 'compact'", scene.disorder.strength)
     if scene.n_bands < 2 or len(scene.tones) != scene.n_bands:

@@ -299,7 +299,7 @@ def check_scene(scene: Scene | None) -> None:
 
 def covered(scene: Scene) -> tuple[Law, Waves]:
     """The law and the waves of a scene; an error for chains that the theory does not hold for."""
-    wanted: dict[str, Any] = {"lattice": None, "energy_definition": "site"}
+    wanted: dict[str, Any] = {"lattice": None, "species": (), "energy_definition": "site"}
     for name, value in wanted.items():
         if getattr(scene, name) != value:
             raise checks.fail(name, f"be {value} for model 'theory'", getattr(scene, name))

@@ -104,8 +104,8 @@ def measure_mixing(
     checks.instance("scene", scene, Scene)
     if scene.lattice is not None:
         raise checks.fail("lattice", "be None: bands of frequency mix by Hertz contacts of chains", repr(scene.lattice))
-    if scene.damping:
-        raise checks.fail("damping", "be 0 where mixing is measured", scene.damping)
+    if scene.largest_damping:
+        raise checks.fail("damping", "be 0 where mixing is measured", scene.largest_damping)
     amplitude = checks.number("amplitude", amplitude, above=0, at_most=1)
     bands = FrequencyBands.covering(scene.chain(range(min(8, scene.realizations)))) if bands is None else bands
     checks.instance("bands", bands, FrequencyBands)

@@ -1,10 +1,17 @@
 """Mixtures of species: their chains, the energy of each species, and complex modes of damped ones."""
 
 from torchchain.species.damped_modes import DampedModes, damped_modes
-from torchchain.species.energy import species_band_energy, species_energy
-from torchchain.species.mixtures import ARRANGEMENTS, Mixture, Species, diatomic_frequencies
+from torchchain.species.energy import species_band_energy, species_energy, species_waves
+from torchchain.species.mixtures import (
+    ARRANGEMENTS,
+    MixedChain,
+    Mixture,
+    Species,
+    diatomic_frequencies,
+    hertz_stiffness,
+)
 
 __all__ = [
-    "ARRANGEMENTS", "DampedModes", "Mixture", "Species", "damped_modes", "diatomic_frequencies", "species_band_energy",
-    "species_energy",
+    "ARRANGEMENTS", "DampedModes", "MixedChain", "Mixture", "Species", "damped_modes", "diatomic_frequencies", "hertz_stiffness",
+    "species_band_energy", "species_energy", "species_waves",
 ]  # fmt: skip

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.chain import Chain
-from torchchain.chain.states import Trajectory
-from torchchain.energy.bands import bin_energy
+from torchchain.chain.excitation import StandingWave
+from torchchain.chain.states import State, Trajectory
+from torchchain.energy.bands import bin_energy, center_tones
 from torchchain.energy.space import DEFINITIONS, particle_energy, require_linear
+from torchchain.species.mixtures import MixedChain
 
 
 def species_energy(
@@ -56,9 +61,9 @@ def species_band_energy(
         n_species: S.
         n_bands: B.
         definition: "bond" transforms sqrt(m) v of the beads of one species and sqrt(kappa) times the elongation of the
-            contacts, the energy of a contact half that of each of its beads: never negative, and with k = 0 the sum of
-            all is the total energy. A random order of species scatters even a plane wave over all bands, as seen by one
-            of them. "site" sums Eq. 42 over the beads of one species, [(m_p v_p) v + (-F_p) u] / 2 with the waves v and u
+            contacts, the energy of a contact half that of each of its beads: never negative, and the sum of all is the
+            total energy, as the first band of each takes in k = 0. A random order of species scatters even a plane wave
+            over all bands, as seen by one of them. "site" sums Eq. 42 over the beads of one species, [(m_p v_p) v + (-F_p) u] / 2 with the waves v and u
             of all beads: sums over species are the band energies of the chain, but one can be far below zero.
 
     Raises:
@@ -94,8 +99,36 @@ def species_band_energy(
             share = chain.of_both_ends(part) / 2
             energy = (_squared(moving * part) + _squared(share.sqrt() * stretched)) / 2
         energy[..., 1 : (n + 1) // 2] *= 2  # k and -k are added, except where they are one wavenumber
+        if definition == "bond":
+            energy[..., 1] += energy[..., 0]
         found.append(bin_energy(energy, n_bands))
     return torch.stack(found, dim=-2)
+
+
+def species_waves(chain: MixedChain, wave: StandingWave, n_bands: int, chosen: Sequence[int]) -> State:
+    """Standing waves of velocity on the beads of one species each, the others and all contacts at rest.
+
+    Args:
+        chain: masses (*batch, particle).
+        wave: amplitude, that of the velocity, and phase.
+        n_bands: bands of every species; each wave has the center tone of one.
+        chosen: which, counted from 1, those of the first species first.
+
+    Returns:
+        State (*batch, wave, particle).
+
+    Example:
+        >>> chain = tc.species.Mixture((tc.species.Species("a"), tc.species.Species("b"))).chain(32, 3, 0)
+        >>> state = tc.species.species_waves(chain, tc.StandingWave(), n_bands=4, chosen=(1, 6))
+        >>> tuple(state.velocity.shape), float(state.displacement.abs().max())
+        ((3, 2, 32), 0.0)
+    """
+    if chain.labels is None:
+        raise checks.fail("chain", "have labels", None)
+    moving = replace(wave, tones=center_tones(chain.n_particles, n_bands)).state(chain).displacement
+    velocity = [moving[..., (band - 1) % n_bands, :] * (chain.labels == (band - 1) // n_bands) for band in chosen]
+    speed = torch.stack(velocity, dim=-2)
+    return State(torch.zeros_like(speed), speed)
 
 
 def _transform(field: Tensor) -> Tensor:
