@@ -11,7 +11,7 @@ import pytest
 
 from torchchain import cli
 from torchchain.cli import outputs
-from torchchain.cli.report import page
+from torchchain.cli.report import LABELS, page
 
 DUMPS = Path(__file__).parent / "data" / "lammps"
 SMALL = ["--n-particles", "32", "--n-bands", "4", "--realizations", "8", "--method", "modes", "--seed", "5"]
@@ -61,6 +61,8 @@ def runs(tmp_path_factory):
             "{group}.reference.dump",
             "--n-bands",
             "3",
+            "--format",
+            "pdf",
         ],
         "again": ["calibrate", *SMALL, "--seed", "6"],
         "compare": ["compare", str(top / "calibrate"), str(top / "again")],
@@ -88,7 +90,7 @@ def test_every_run_leaves_a_whole_page(runs, command):
     for reason in record["reasons"]:
         assert " ".join(reason.split()) in seen.text
     for name, value in record.get("summary", {}).items():
-        assert name in seen.text
+        assert LABELS.get(name, name) in seen.text
         if isinstance(value, float):
             assert f"{value:.4g}" in seen.text
     for quantity, value, error in record.get("measured", []):
@@ -103,7 +105,12 @@ def test_what_is_told_of_each(runs):
     assert "figure.pdf" in calibrated
     assert (runs / "calibrate" / "figure.pdf").read_bytes().startswith(b"%PDF")
     assert "one band each" in read(runs / "import").text
-    assert "setting one other" in read(runs / "compare").text
+    assert (runs / "import" / "figure.pdf").read_bytes().startswith(b"%PDF")
+    compared = read(runs / "compare").text
+    assert "setting one other" in compared
+    assert "n values largest difference rms z" in compared  # a table, without what is no number
+    assert "nan" not in compared
+    assert re.search(r"band_energy at the last time, tone \d+, largest \(band \d\) 0\.\d+ ± 0\.\d+", read(runs / "simulate").text)
     rows = (runs / "sweep" / "sweep.csv").read_text().splitlines()
     assert all(name in read(runs / "sweep").text for name in rows[0].split(","))
 

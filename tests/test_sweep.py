@@ -3,6 +3,7 @@
 import csv
 import json
 
+import numpy as np
 import pytest
 import xarray
 
@@ -10,7 +11,7 @@ import torchchain as tc
 from torchchain import cli
 from torchchain.cli import outputs
 from torchchain.cli.compare import differing
-from torchchain.cli.sweep import combinations, swept
+from torchchain.cli.sweep import combinations, panels, swept
 
 CONFIG = "realizations = 6\nn_bands = 4\nn_particles = 32\ntimes = {stop = 5.0, step = 1.0}\nseed = 3\n"
 
@@ -125,3 +126,11 @@ def test_two_runs_compared(capsys):
 
 def test_settings_that_differ():
     assert differing({"a": 1, "t": {"x": 1, "y": 2}}, {"a": 1, "t": {"x": 3}}) == {"t.x": (1, 3), "t.y": (2, None)}
+
+
+def test_the_figure_shows_what_was_measured_with_its_errors_and_what_differs():
+    data = xarray.Dataset({"run_tv": ("n", [0.1, 0.2]), "run_same": ("n", [1.0, 1.0]), "run_horizon": ("n", [np.inf, np.inf])})
+    shown = panels(data, [{"measured": [("R", 1.0, 0.1), ("one", 1.0, 1.0)]}, {"measured": [("R", 2.0, None)]}])
+    assert list(shown) == ["R", "total variation, model and ensemble"]
+    np.testing.assert_array_equal(shown["R"], [[1.0, 2.0], [0.1, np.nan]])
+    assert list(panels(data[["run_same"]], [{}, {}])) == ["same"]  # a figure all the same

@@ -19,6 +19,12 @@ from torchchain.results import open_folder, read_dataset
 if TYPE_CHECKING:
     import xarray
 
+REASONS = [
+    "every value that both results hold at the same coordinates is compared: z is the difference over the root of the sum of both squared standard errors",
+    "two samples of one ensemble have rms z = 1, and 68 % of the values within 1",
+    "total variation: mean over sources and times of half the sum of |difference| over bands, beside what two samples of one ensemble with these errors are expected to have",
+]
+
 
 def run_compare(flags: Compare, arguments: list[str]) -> None:
     """Compare two results and leave the numbers and the figure."""
@@ -30,9 +36,9 @@ def run_compare(flags: Compare, arguments: list[str]) -> None:
         settings = differing(first, second)
         figure = _figure(a, b, found)
         written = outputs.reported(
-            out, arguments, "", "cpu", began, {}, title=f"{flags.a} and {flags.b}", warnings=warned, reasons=list(map(str, found)),
+            out, arguments, "", "cpu", began, {}, title=f"{flags.a} and {flags.b}", warnings=warned, reasons=REASONS,
             compared=[{"path": str(Path(path).resolve())} for path in (flags.a, flags.b)],
-            summary={agreement.variable: dataclasses.asdict(agreement) for agreement in found},
+            summary={agreement.variable: _numbers(agreement) for agreement in found},
             settings={name: [checks.shown(value) for value in pair] for name, pair in settings.items()},
         )  # fmt: skip
         outputs.write(out, {**outputs.figures(figure, flags.format), **written})
@@ -41,6 +47,10 @@ def run_compare(flags: Compare, arguments: list[str]) -> None:
     for agreement in found:
         print(agreement)
     print(f"results in {flags.out}")
+
+
+def _numbers(agreement: Agreement) -> dict[str, Any]:
+    return {name: value for name, value in dataclasses.asdict(agreement).items() if name != "variable"}
 
 
 def differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:
@@ -74,26 +84,27 @@ def _by_source(data: xarray.Dataset) -> xarray.Dataset:
 
 
 def _figure(a: xarray.Dataset, b: xarray.Dataset, found: list[Agreement]) -> Any:
-    """For every observable the histogram of z-scores beside the normal density, and their mean square over time."""
+    """For every observable with standard errors the z-scores beside the normal density and, over time, their mean square."""
+    known = [agreement for agreement in found if np.isfinite(agreement.rms_z)]
+    scores = {agreement.variable: z_scores(a, b, agreement.variable) for agreement in known}
+    panels = [(name, over) for name, z in scores.items() for over in ("all", *(["time"] if "time" in z.dims else []))]
     with plots.style():
-        figure, axes = plots.figure(plots.PAGE, 2.6 * len(found), len(found), 2)
-        for (left, right), agreement in zip(axes, found, strict=True):
-            z = z_scores(a, b, agreement.variable)
-            values = z.values[np.isfinite(z.values)]
-            if not values.size:
-                left.set_axis_off()
-                right.set_axis_off()
-                left.text(0.5, 0.5, f"{agreement.variable}: no standard errors", ha="center")
+        rows = max(1, -(-len(panels) // 2))
+        figure, axes = plots.figure(plots.PAGE, 2.6 * rows, rows, 2)
+        for ax, (name, over) in zip(axes.flat, panels, strict=False):
+            z = scores[name]
+            if over == "all":
+                _histogram(ax, z.values[np.isfinite(z.values)], name)
                 continue
-            _histogram(left, values, agreement.variable)
-            if "time" in z.dims:
-                mean = np.sqrt((z**2).mean([axis for axis in z.dims if axis != "time"]))
-                right.plot(z["time"], mean, label="these results")
-                right.axhline(1, color="k", ls="--", label="one ensemble")
-                right.set(xlabel=plots.TIME_LABEL, ylabel="root mean square $z$-score", ylim=(0, None))
-                plots.legend(right)
-            else:
-                right.set_axis_off()
+            mean = np.sqrt((z**2).mean([axis for axis in z.dims if axis != "time"]))
+            ax.plot(z["time"], mean, label="these results")
+            ax.axhline(1, color="k", ls="--", label="one ensemble")
+            ax.set(xlabel=plots.TIME_LABEL, ylabel="root mean square $z$-score", ylim=(0, None), title=name.replace("_", " "))
+            plots.legend(ax)
+        for ax in list(axes.flat)[len(panels) :]:
+            ax.set_axis_off()
+        if not panels:
+            axes[0, 0].text(0, 0.5, "no standard errors, hence no z-scores")
         plots.lettered(axes.flat)
     return figure
 

@@ -289,7 +289,7 @@ class FileFlags:
     """Flags of the commands that read files of other codes."""
 
     format: Annotated[str | None, flag(choices.FORMATS, "what the file begins with")] = None
-    """of the files"""
+    """of the files that are read"""
     time_step: Annotated[float | None, flag("FLOAT")] = None
     """time between two step numbers, for dumps that do not state their times"""
     masses: Annotated[str | None, flag("FLOAT|TYPE=FLOAT,...|FILE")] = None
@@ -334,6 +334,10 @@ class Import(FileFlags):
     """packings: longest wavevector |q| of the shells"""
     long_time: Annotated[str, flag(("exact", "late"), "exact")] = "exact"
     """infinite-time average: from the modes of linear undamped rings, or over the later half of the times"""
+    format: Annotated[str | None, flag((*choices.FORMATS, *choices.FIGURES), "what the files begin with; png")] = None
+    """of the files that are read, or of the figure besides PNG"""
+    figure: Annotated[str, flag(choices.FIGURES, "png")] = "png"
+    """of the figure, where --format names that of the files"""
     calibrate: Annotated[str | None, flag("FOLDER")] = None
     """also calibrate a master equation on the transfer, and leave it with its figure in this folder"""
     out: Annotated[str, flag("FOLDER", "results/import")] = "results/import"

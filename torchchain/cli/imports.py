@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,9 @@ class RunFiles:
 def run_import(flags: Import, arguments: list[str]) -> None:
     """Read the runs, average their band energies and leave transfer, figure and record."""
     began, stages = time.time(), Stages()
+    checks.choice("figure", flags.figure, choices.FIGURES)
+    if flags.format in choices.FIGURES:
+        flags = replace(flags, format=None, figure=flags.format)
     _check(flags)
     files = files_of(flags)
     with outputs.run_folder(flags.out) as out, outputs.told_warnings() as warned:
@@ -85,7 +88,7 @@ def run_import(flags: Import, arguments: list[str]) -> None:
             {
                 "config.toml": outputs.text(config),
                 "transfer.nc": outputs.dataset(transfer.to_dataset()),
-                **outputs.figures(figure),
+                **outputs.figures(figure, flags.figure),
                 **written,
             },
         )
@@ -94,8 +97,8 @@ def run_import(flags: Import, arguments: list[str]) -> None:
     print(starts)
     print(f"{time.time() - began:.1f} s, results in {flags.out}")
     if flags.calibrate is not None:
-        after = ["calibrate", "--transfer", flags.out, "--out", flags.calibrate]
-        run_calibrate(Calibrate(transfer=flags.out, out=flags.calibrate), after)
+        after = ["calibrate", "--transfer", flags.out, "--out", flags.calibrate, "--format", flags.figure]
+        run_calibrate(Calibrate(transfer=flags.out, out=flags.calibrate, format=flags.figure), after)
 
 
 @contextmanager

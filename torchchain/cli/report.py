@@ -43,12 +43,18 @@ BIBTEX = """@software{{torchchain,
   journal = {{Materials}}, year = {{2021}}, volume = {{14}}, number = {{7}}, pages = {{1815}},
   doi = {{10.3390/ma14071815}}
 }}"""
+LABELS = {
+    "mass_mean": "masses: mean",
+    "mass_sd": "masses: standard deviation",
+    "start_condition": "condition of the least squares over starts (1: every start in one band)",
+}
+"""Of names of the files, in words."""
 STYLE = """
 :root { color-scheme: light; }
 body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; max-width: 56rem; margin: 0 auto; padding: 1rem; overflow-wrap: anywhere; }
 h1 { font-size: 1.5rem; line-height: 1.25; margin: .5rem 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; border-bottom: 1px solid #ccc; }
 .by { color: #555; margin: 0; } img { width: 100%; min-width: 36rem; height: auto; }
-table { border-collapse: collapse; width: 100%; overflow-wrap: normal; } .wide { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; overflow-wrap: normal; margin-bottom: .75rem; } .wide { overflow-x: auto; }
 th, td { text-align: left; vertical-align: top; padding: .25rem .75rem .25rem 0; border-bottom: 1px solid #e5e5e5; }
 td.number { font-variant-numeric: tabular-nums; white-space: nowrap; overflow-wrap: normal; }
 pre { background: #f5f5f5; padding: .75rem; overflow-x: auto; font-size: .85rem; overflow-wrap: normal; }
@@ -145,16 +151,27 @@ def _measured(rows: Sequence[Sequence[Any]]) -> list[str]:
     """Values with their standard errors."""
     if not rows:
         return []
-    told = ((name, f"{value:.4g}" + ("" if error is None else f" ± {error:.2g}")) for name, value, error in rows)
-    return [_table(told, ("measured", "value ± standard error"))]
+    told = [(name, f"{value:.4g}" + ("" if error is None else f" ± {error:.2g}")) for name, value, error in rows]
+    more = [f"<p>{len(told) - MOST_ROWS} more in the records of the runs.</p>"] if len(told) > MOST_ROWS else []
+    return [_table(told[:MOST_ROWS], ("measured", "value ± standard error")), *more]
 
 
 def _summary(record: Mapping[str, Any]) -> list[str]:
-    rows = [
-        (name, ", ".join(f"{n} {_shown(v)}" for n, v in value.items()) if isinstance(value, Mapping) else value)
-        for name, value in (record.get("summary") or {}).items()
-    ]
-    return [_table(rows)] if rows else []
+    """Names and values; of names that hold the same names, a table with a column for each."""
+    told = record.get("summary") or {}
+    parts = []
+    if plain := [(LABELS.get(name, name), value) for name, value in told.items() if not isinstance(value, Mapping)]:
+        parts.append(_table(plain))
+    if nested := {name: value for name, value in told.items() if isinstance(value, Mapping)}:
+        columns = list(dict.fromkeys(column for value in nested.values() for column in value))
+        rows = ([name, *(_known(value.get(column)) for column in columns)] for name, value in nested.items())
+        parts.append(_table(rows, ["", *(column.replace("_", " ") for column in columns)]))
+    return parts
+
+
+def _known(value: Any) -> Any:
+    """A dash for what is not there, or no number."""
+    return "-" if value is None or (isinstance(value, float) and math.isnan(value)) else value
 
 
 def _tables(folder: Path) -> list[str]:

@@ -7,6 +7,7 @@ import io
 import itertools
 import json
 import math
+import textwrap
 import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -86,10 +87,14 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
         data = combined(fields, [folder.data for folder in folders], rows)
         text = tomli_w.dumps({**config, "sweep": {name: list(values) for name, values in fields.items()}})
         with plots.style():
-            figure = _figure(fields, data)
+            figure = _figure(fields, panels(data, [folder.record for folder in folders]))
         written = outputs.reported(
             out, arguments, text, flags.device, began, {}, seed=config.get("seed", 0), runs=[point.name for point in points],
             title=f"{len(points)} runs of {flags.command} over {', '.join(fields)}", warnings=warned,
+            measured=[
+                (f"{_varied(fields, point)}: {name}", value, error)
+                for point, folder in zip(points, folders, strict=True) for name, value, error in folder.record.get("measured") or ()
+            ],
             reasons=["every run has a report of its own in the folder runs", *left_out(data)],
         )  # fmt: skip
         outputs.write(out, {
@@ -169,6 +174,12 @@ def _done(folder: Path, text: str) -> bool:
     return (folder / outputs.RECORD).is_file() and request.is_file() and request.read_text(encoding="utf-8") == text
 
 
+def _varied(fields: Mapping[str, Sequence[Any]], point: Point) -> str:
+    """A run by the values of the fields that differ between the runs."""
+    told = zip(fields.items(), point.values, strict=True)
+    return ", ".join(f"{name} = {value}" for (name, values), value in told if len(values) > 1) or point.name
+
+
 def _row(record: Mapping[str, Any]) -> dict[str, float]:
     """The numbers that sum a run up."""
     found: dict[str, float] = {}
@@ -228,26 +239,59 @@ def _table(fields: Mapping[str, Any], points: Sequence[Point], rows: Sequence[Ma
     return text.getvalue()
 
 
-def _figure(fields: Mapping[str, Sequence[Any]], data: xarray.Dataset) -> Any:
-    """The numbers that sum the runs up over the first field, one line for each combination of the others."""
-    names = [str(name) for name in data.data_vars if str(name).startswith("run_")][:MOST_PANELS]
-    columns = min(3, len(names))
-    rows = math.ceil(len(names) / columns)
+def panels(
+    data: xarray.Dataset, records: Sequence[Mapping[str, Any]]
+) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
+    """What the figure shows, by name: values over the swept fields, and standard errors of what was measured.
+
+    First what every run measured, then the numbers that sum the runs up and differ between them.
+    """
+    sums = {str(name): values for name, values in data.data_vars.items() if str(name).startswith("run_")}
+    shape = next(iter(sums.values())).shape
+    measured = [{name: (value, error) for name, value, error in record.get("measured") or ()} for record in records]
+    found: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
+    for name in [name for name in measured[0] if all(name in other for other in measured)]:
+        values, errors = np.array([[math.nan if x is None else x for x in other[name]] for other in measured]).T
+        found[name] = values.reshape(shape), errors.reshape(shape)
+    several = [name for name, values in sums.items() if np.ptp(np.nan_to_num(values.values, posinf=-1.0)) > 0]
+    for name in sorted(several or sums, key=lambda name: [*LABELS, name].index(name)):
+        found[LABELS.get(name, name.removeprefix("run_").replace("_", " "))] = sums[name].values, None
+    return dict(itertools.islice(found.items(), MOST_PANELS))
+
+
+LABELS = {
+    "run_tv": "total variation, model and ensemble", "run_tv_noise": "total variation, two ensembles",
+    "run_n_parameters": "fitted numbers", "run_mass_mean": "mean mass", "run_mass_sd": "standard deviation of masses",
+    "run_horizon": "last time compared with chains",
+}  # fmt: skip
+
+
+def _figure(
+    fields: Mapping[str, Sequence[Any]], shown: Mapping[str, tuple[np.ndarray, np.ndarray | None]]
+) -> Any:
+    """Every quantity over the first field, one line for each combination of the others that vary."""
+    columns = min(3, len(shown))
+    rows = math.ceil(len(shown) / columns)
     figure, axes = plots.figure(plots.PAGE * columns / 3, 2.4 * rows, rows, columns)
     first, *others = fields
     numeric = all(isinstance(value, (int, float)) for value in fields[first])
     x = fields[first] if numeric else range(len(fields[first]))
-    for ax, name in zip(axes.flat, names, strict=False):
-        for chosen in itertools.product(*(range(len(fields[other])) for other in others)):
-            line = data[name].isel(dict(zip(others, chosen, strict=True)))
-            label = ", ".join(f"{other} = {fields[other][i]}" for other, i in zip(others, chosen, strict=True))
-            ax.plot(x, line.values, marker="o", label=label or None)
-        ax.set(xlabel=first, ylabel=name.removeprefix("run_").replace("_", " "))
-        if not numeric:
+    varied = [other for other in others if len(fields[other]) > 1]
+    for ax, (name, (values, errors)) in zip(axes.flat, shown.items(), strict=False):
+        for i, chosen in enumerate(itertools.product(*(range(len(fields[other])) for other in others))):
+            of = dict(zip(others, chosen, strict=True))
+            label = ", ".join(f"{other} = {fields[other][of[other]]}" for other in varied)
+            at: Any = (slice(None), *chosen)
+            error = None if errors is None else errors[at]
+            ax.errorbar(x, values[at], error, marker="os^vDP*"[i % 7], label=label or None)
+        ax.set(xlabel=first, ylabel=textwrap.fill(name, 32))
+        if numeric:
+            ax.set_xticks(list(x), [f"{value:g}" for value in x])
+        else:
             ax.set_xticks(list(x), [str(value) for value in fields[first]])
-    if others and names:
+    if varied and shown:
         figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    for ax in list(axes.flat)[len(names) :]:
+    for ax in list(axes.flat)[len(shown) :]:
         ax.set_axis_off()
     plots.lettered(axes.flat)
     return figure
