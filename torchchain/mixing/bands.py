@@ -68,7 +68,11 @@ class FrequencyBands:
 
 
 def frequency_band_energy(
-    chain: Chain, trajectory: Trajectory, bands: FrequencyBands, modes: NormalModes | None = None
+    chain: Chain,
+    trajectory: Trajectory,
+    bands: FrequencyBands,
+    modes: NormalModes | None = None,
+    members: Tensor | None = None,
 ) -> Tensor:
     """Energy of the modes in each band of frequency, sum over j of (p_j^2 + w_j^2 q_j^2) / 2 with q = S^T M u (Eq. 18).
 
@@ -80,6 +84,7 @@ def frequency_band_energy(
         trajectory: displacement and velocity (*batch, *any, time, particle), in initial overlaps.
         bands: of frequency.
         modes: of the linear chain, where they are at hand.
+        members: which of them lie in each band, :meth:`FrequencyBands.members`, where that is at hand.
 
     Returns:
         (*batch, *any, time, band), in units of stiffness times overlap squared.
@@ -97,4 +102,5 @@ def frequency_band_energy(
     position = change_basis(masses * trajectory.displacement, modes.shapes)
     speed = change_basis(masses * trajectory.velocity, modes.shapes)
     frequency = chain.align(modes.frequencies, position)
-    return change_basis((speed.square() + (frequency * position).square()) / 2, bands.members(modes.frequencies))
+    members = bands.members(modes.frequencies) if members is None else members
+    return change_basis((speed.square() + (frequency * position).square()) / 2, members)

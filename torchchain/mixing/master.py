@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.excitation import StandingWave
-from torchchain.energy.bands import band_of
+from torchchain.energy.bands import bin_energy, check_bands
 from torchchain.ensemble.scene import Scene
 from torchchain.master.equation import MasterEquation
 from torchchain.mixing.bands import FrequencyBands
@@ -202,14 +202,13 @@ def spectrum_and_shapes(scene: Scene, bands: FrequencyBands, realizations: int =
     chain = scene.chain(range(count))
     modes = normal_modes(chain)
     members = bands.members(modes.frequencies)
-    tones = torch.arange(1, n // 2 + 1)
-    of_tone = torch.nn.functional.one_hot(torch.tensor([band_of(int(t), n, scene.n_bands) for t in tones]) - 1, scene.n_bands).to(torch.float64)  # fmt: skip
-    wave = StandingWave(tones=tuple(tones.tolist()), phase="cos").state(chain)
+    width = check_bands(n, scene.n_bands)
+    wave = StandingWave(tones=tuple(range(1, n // 2 + 1)), phase="cos").state(chain)
     amplitude = modal_amplitudes(chain, wave, modes)[0]
     energy = change_basis((modes.frequencies[:, None] * amplitude).square(), members)
-    spectrum = of_tone.T @ (energy / energy.sum(-1, keepdim=True)).mean(0)
+    spectrum = (energy / energy.sum(-1, keepdim=True)).mean(0).unflatten(0, (scene.n_bands, width)).mean(1)
     moved, shape = (torch.fft.rfft(x.mT, norm="ortho") for x in (chain.masses[..., None] * modes.shapes, modes.shapes))
-    share = (moved * shape.conj()).real[..., 1:] * 2
-    share[..., -1] /= 2 if n % 2 == 0 else 1
-    shapes = (members.mT @ share).sum(0) @ of_tone
-    return tuple(x / x.sum(-1, keepdim=True) for x in (spectrum, shapes))  # type: ignore[return-value]
+    share = (moved * shape.conj()).real
+    share[..., 1:-1] *= 2
+    shapes = bin_energy((members.mT @ share).sum(0), scene.n_bands)
+    return spectrum / spectrum.sum(-1, keepdim=True), shapes / shapes.sum(-1, keepdim=True)

@@ -120,11 +120,12 @@ def measure_mixing(
         linear = replace(scene, contact="linear", tolerance=None).chain(numbers)
         modes = normal_modes(linear)
         hertz = replace(linear, contact="hertz")
-        members += bands.members(modes.frequencies).sum((0, 1))
+        sorted_in = bands.members(modes.frequencies)
+        members += sorted_in.sum((0, 1))
         for i, share in enumerate(shares):
-            state = random_phases(linear, modes, bands, share * amplitude**2, [(scene.seed, n, i) for n in numbers])
+            state = random_phases(linear, modes, sorted_in, share * amplitude**2, [(scene.seed, n, i) for n in numbers])
             path = evolve(hertz, state, times, method="verlet", step=step)
-            energies[numbers, i] = frequency_band_energy(hertz, path, bands, modes) / scene.n_particles
+            energies[numbers, i] = frequency_band_energy(hertz, path, bands, modes, sorted_in) / scene.n_particles
             assert path.openings is not None, "counted for Hertz contacts"
             opened[i] += path.openings[:, -1].sum() / hertz.n_contacts / scene.realizations
             if progress is not None:
@@ -149,14 +150,14 @@ def _checked_starts(starts: Any, bands: FrequencyBands) -> Tensor:
 
 
 def random_phases(
-    chain: Chain, modes: NormalModes, bands: FrequencyBands, energy: Tensor, keys: list[tuple[int, int, int]]
+    chain: Chain, modes: NormalModes, members: Tensor, energy: Tensor, keys: list[tuple[int, int, int]]
 ) -> State:
     """A state whose modes share the energy of their band equally, with phases that are random and independent.
 
     Args:
         chain: masses (realization, particle).
         modes: of the linear chain.
-        bands: of frequency.
+        members: which modes lie in each band of frequency, :meth:`FrequencyBands.members`.
         energy: per particle in each band, (band,).
         keys: seed, realization and number of the start, which alone decide the phases of each chain.
 
@@ -166,11 +167,11 @@ def random_phases(
     Example:
         >>> chain = tc.Chain(tc.Disorder().masses(16, 1, 0), boundary="fixed")
         >>> bands, energy = tc.mixing.FrequencyBands(4), torch.tensor([0.0, 0.01, 0.0, 0.0], dtype=torch.float64)
-        >>> state = tc.mixing.random_phases(chain, tc.normal_modes(chain), bands, energy, keys=[(0, 0, 0)])
+        >>> modes = tc.normal_modes(chain)
+        >>> state = tc.mixing.random_phases(chain, modes, bands.members(modes.frequencies), energy, keys=[(0, 0, 0)])
         >>> round(float(chain.energy(state.displacement, state.velocity)), 6)
         0.16
     """
-    members = bands.members(modes.frequencies)
     share = members / members.sum(-2, keepdim=True).clamp(min=1)
     of_mode = chain.n_particles * (share @ energy)
     draws = [
