@@ -257,8 +257,10 @@ def resolved(scene: Scene) -> Scene:
 
 
 def statistical_error(scene: Scene) -> float:
-    """Rough standard error of an ensemble mean relative to the scale of the observable: xi / (2 sqrt(R))."""
+    """Rough standard error of an ensemble mean relative to the scale of the observable: xi / (2 sqrt(R)), of mixtures the species' spread."""
     kinds = [scene.disorder.strength, scene.stiffness_disorder.strength if scene.stiffness_disorder else 0.0]
+    if scene.mixture is not None:
+        kinds.append(scene.mixture.spread)
     return min(1.0, max(kinds)) / (2 * math.sqrt(scene.realizations))
 
 

@@ -80,7 +80,8 @@ class Facts:
         lasting = self.end
         if self.impulse:
             kinds = self.scene.disorder, self.scene.stiffness_disorder
-            localized = min(1.0, max(kind.strength for kind in kinds if kind is not None))
+            mixed = 0.0 if self.scene.mixture is None else self.scene.mixture.spread
+            localized = min(1.0, max(mixed, *(kind.strength for kind in kinds if kind is not None), 0.0))
             lasting = 0.05 * max(1.5 * ((1 + self.end) ** (2 / 3) - 1), localized * self.end)
         return self.deviation * (1 + 0.5 * w * lasting)
 

@@ -207,6 +207,17 @@ class Mixture:
         return (stiffness / min(entry.mass for entry in self.species)) ** 0.5
 
     @property
+    def spread(self) -> float:
+        """Standard deviation of masses or stiffnesses over their mean, whichever is larger, if beads come in random order."""
+        if self.is_ordered:
+            return 0.0
+        found, weights = 0.0, self._of("fraction")
+        for values in (self._of("mass"), self._of("stiffness")):
+            mean = (weights * values).sum()
+            found = max(found, float((weights * (values - mean).square()).sum().sqrt() / mean))
+        return found
+
+    @property
     def is_ordered(self) -> bool:
         """Whether the order of the beads is the same in every realization."""
         return self.arrangement != "random" or len(self.species) == 1
