@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from torchchain import checks
+from torchchain.ensemble.contact_models import ContactModel, contact_models
 from torchchain.ensemble.lattice_facts import LatticeFacts
 from torchchain.ensemble.layout import Layout, layout
 from torchchain.ensemble.predictions import TRIG, Facts, cost, error_of, facts_of, settle
@@ -74,6 +75,8 @@ class Plan(Printed):
         reasons: why, in plain words.
         runners_up: the other ways that meet the tolerance, and those that do not, by predicted time.
         cost: seconds of one nominal core.
+        contact_models: linear, linear plus quadratic and Hertz contacts, with the edge where each stops being enough; of
+            standing waves on undamped chains, else none.
 
     Example:
         >>> plan = tc.plan(tc.Scene(n_particles=4096, boundary="fixed", excitation=tc.Impulse(), observables=("center",), tolerance=1e-8))
@@ -92,6 +95,7 @@ class Plan(Printed):
     reasons: tuple[str, ...]
     runners_up: tuple[Choice, ...] = field(default=())
     cost: float = 0.0
+    contact_models: tuple[ContactModel, ...] = ()
 
     @property
     def run_options(self) -> dict[str, Any]:
@@ -153,7 +157,9 @@ def plan(scene: Scene, stand_in: StandIn | None = None) -> Plan:
 def _plan(scene: Scene, stand_in: StandIn | None) -> Plan:
     facts = facts_of(scene if scene.contact != "auto" else replace(scene, contact="linear"))
     tolerance, reasons = _tolerance(scene)
+    asked = scene.contact
     scene, facts, why, off = _settled(scene, facts, tolerance)
+    models = _contact_models(scene, facts, tolerance)
     layouts = {name: _layout(name, scene) for name in scene.methods if _can(name, scene)}
     usable = {name: found for name, found in layouts.items() if found is not None}
     if not usable:
@@ -179,12 +185,28 @@ def _plan(scene: Scene, stand_in: StandIn | None) -> Plan:
         )
     loaded = [choice for choice in good if choice.method in STAND_INS or not scene.methods[choice.method].compiled]
     best = loaded[0] if loaded and loaded[0].cost < SMALL_WORK else good[0]
+    if models and (asked != "linear" or not models[0].enough):
+        remarks = [*remarks, _contact_words(models)]
     reasons = [*reasons, *why, *_method_reasons(best, good, facts, usable), *remarks]
     return Plan(
         scene, best.method, best.options, best.dtype, best.allowed, best.predicted_error, best.predicted_seconds,
         facts.n if isinstance(facts, Facts) and facts.part is not None else math.ceil(facts.moving()), tuple(reasons),
-        tuple(choice for choice in choices if choice is not best), best.cost,
+        tuple(choice for choice in choices if choice is not best), best.cost, models,
     )  # fmt: skip
+
+
+def _contact_models(scene: Scene, facts: Facts | LatticeFacts, tolerance: float) -> tuple[ContactModel, ...]:
+    """What was measured of waves spread over the chain; a pulse spreads and soon is linear, see :attr:`Facts.accumulated`."""
+    if isinstance(facts, LatticeFacts) or facts.impulse or scene.largest_damping > 0:
+        return ()
+    return contact_models(facts.mean_elongation, facts.end, tolerance)
+
+
+def _contact_words(models: tuple[ContactModel, ...]) -> str:
+    """The ladder of contact laws, in words."""
+    steps = [f"{each.name} {each.error:.1e} (enough to elongation {each.edge:.2g})" for each in models[:2]]
+    least = next(each.name for each in models if each.enough)
+    return f"energies that Hertz contacts move between frequencies: {', '.join(steps)}; {least} contacts are enough here"
 
 
 def _seconds(

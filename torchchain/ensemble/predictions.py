@@ -34,6 +34,7 @@ class Facts:
         typical: highest frequency of a chain, their mean.
         limit: frequency that no chain of the ensemble is expected to exceed.
         elongation, deviation: largest of the start, and of the Hertz force from the linear there.
+        mean_elongation: the square root of the start's energy per particle.
         gaps: times from each output to the next, (time,).
     """
 
@@ -56,6 +57,8 @@ class Facts:
         self._state = inner.state(self._linear)
         self.elongation = float(elongation_estimate(self._linear, self._state).max())
         self.deviation = float(force_deviation(torch.tensor(self.elongation, dtype=torch.float64)))
+        energy = self._linear.energy(self._state.displacement, self._state.velocity)
+        self.mean_elongation = float((energy / self.n).mean(0).max().sqrt())
         self.gaps = torch.cat([scene.times[:1], scene.times.diff()])
         self.end = float(scene.times[-1])
         self.typical = float(bounds.mean())

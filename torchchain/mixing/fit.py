@@ -17,6 +17,9 @@ from torchchain.mixing.triads import TriadModel, triads_of
 
 CLOSURE = 0.003
 """Share of the energy by which bands, each described by one number, miss the chains: added to the standard error."""
+SETTLED = 30.0
+"""Time after which energies are compared: by then the harmonics that are carried along without resonance have come, a share in
+proportion to the energy that no triad makes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +28,10 @@ class TriadFit:
 
     Attributes:
         model: with the couplings G.
-        stderr: of G by bootstrap over realizations, (triad,); zero without one.
+        stderr: of G by bootstrap over realizations and starts, (triad,); zero without one. Starts disagree by more than noise
+            where one number a band does not tell enough.
         misfit: root mean square of what is left over, in units of its error.
+        total_stderr: of the sum of G.
 
     Example:
         >>> scene = tc.Scene(n_particles=32, boundary="fixed", n_bands=4, realizations=8)
@@ -39,19 +44,20 @@ class TriadFit:
     model: TriadModel
     stderr: Tensor
     misfit: float
+    total_stderr: float = 0.0
 
 
 def fit_triads(*data: Mixing, bootstrap: int = 20) -> TriadFit:
     """Couplings G >= 0 of a :class:`TriadModel` from one measurement or several, whatever their amplitude.
 
-    The rates are linear in G. Integrated from time 0 along the measured mean energies they are the change of these, so
-    that no derivative of noisy data is taken: e(t) - e(0) = sum over triads of G times the integral of J / G (Simpson's
-    rule), weighed by the standard error plus 0.3 % of the total. Non-negative least squares: C. L. Lawson and R. J. Hanson,
+    The rates are linear in G. Integrated along the measured mean energies they are the change of these, so that no derivative
+    of noisy data is taken: e(t) - e(s) = sum over triads of G times the integral of J / G from s to t (Simpson's rule),
+    weighed by the standard error plus 0.3 % of the total, from s = 30 on (the middle of shorter runs). Non-negative least squares: C. L. Lawson and R. J. Hanson,
     Solving Least Squares Problems (1974), by SciPy.
 
     Args:
         data: of the same bands.
-        bootstrap: how often realizations are drawn again for the standard error; 0 for none.
+        bootstrap: how often realizations and starts are drawn again for the standard error; 0 for none.
 
     Raises:
         FieldError: for none or for different bands, fewer than 3 times, or too few realizations.
@@ -75,28 +81,34 @@ def fit_triads(*data: Mixing, bootstrap: int = 20) -> TriadFit:
         checks.integer("data.realizations", len(entry.energies), 2)
     density = torch.stack([entry.density for entry in data]).mean(0)
     unit = TriadModel(data[0].bands, density, torch.ones(len(triads_of(data[0].bands)[0])))
-    coupling, misfit = _coupling(data, unit, [torch.arange(len(entry.energies)) for entry in data])
+    coupling, misfit = _coupling([(entry.times, entry.energies) for entry in data], unit)
     draw = np.random.default_rng(data[0].scene.seed)
-    again = [
-        _coupling(data, unit, [torch.from_numpy(draw.integers(0, n, n)) for n in (len(d.energies) for d in data)])[0]
-        for _ in range(bootstrap)
-    ]
-    stderr = torch.stack(again).std(0) if len(again) > 1 else torch.zeros_like(coupling)
-    return TriadFit(TriadModel(data[0].bands, density, coupling), stderr, misfit)
+    again = [_coupling([(entry.times, _drawn(entry.energies, draw)) for entry in data], unit)[0] for _ in range(bootstrap)]
+    model = TriadModel(data[0].bands, density, coupling)
+    if len(again) < 2:
+        return TriadFit(model, torch.zeros_like(coupling), misfit)
+    return TriadFit(model, torch.stack(again).std(0), misfit, float(torch.stack(again).sum(1).std()))
 
 
-def _coupling(data: tuple[Mixing, ...], unit: TriadModel, chosen: list[Tensor]) -> tuple[Tensor, float]:
-    """G and the misfit, from the chosen realizations of each measurement; ``unit`` is the model of couplings 1."""
+def _drawn(energies: Tensor, draw: np.random.Generator) -> Tensor:
+    """As many realizations and starts, drawn with replacement."""
+    rows, starts = (torch.from_numpy(draw.integers(0, n, n)) for n in energies.shape[:2])
+    return energies[rows][:, starts]
+
+
+def _coupling(data: list[tuple[Tensor, Tensor]], unit: TriadModel) -> tuple[Tensor, float]:
+    """G and the misfit, from times and energies of each measurement; ``unit`` is the model of couplings 1."""
     matrix, change = [], []
-    for entry, rows in zip(data, chosen, strict=True):
-        energies = entry.energies[rows]
+    for times, energies in data:
+        first = int((times < min(SETTLED, float(times[-1]) / 2)).sum())
         mean, stderr = energies.mean(0), energies.std(0) / math.sqrt(len(energies))
         flux = unit.flux(mean.clamp(min=0)).numpy()
-        dose = torch.from_numpy(cumulative_simpson(flux, x=entry.times.numpy(), axis=1, initial=0))
-        weight = 1 / (stderr + CLOSURE * mean.sum(-1, keepdim=True))[:, 1:]
-        made = dose[:, 1:, None, :] * unit.exchange.T  # (start, time, band, triad)
+        dose = torch.from_numpy(cumulative_simpson(flux, x=times.numpy(), axis=1, initial=0))
+        later = slice(first + 1, None)
+        weight = 1 / (stderr + CLOSURE * mean.sum(-1, keepdim=True))[:, later]
+        made = (dose[:, later] - dose[:, first, None])[:, :, None] * unit.exchange.T  # (start, time, band, triad)
         matrix.append((weight[..., None] * made).flatten(0, 2))
-        change.append((weight * (mean[:, 1:] - mean[:, :1])).flatten())
+        change.append((weight * (mean[:, later] - mean[:, first, None])).flatten())
     joined, target = torch.cat(matrix), torch.cat(change)
     coupling, residual = nnls(joined.numpy(), target.numpy(), maxiter=100 * joined.shape[1])
     return torch.from_numpy(coupling), residual / math.sqrt(len(target))
