@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -66,6 +67,14 @@ def n_coefficients(degrees: Sequence[int]) -> int:
     """Fitted numbers of a model of these degrees; they do not depend on the number of bands."""
     p, q = terms(checked_degrees(degrees))
     return len(p) + len(q)
+
+
+def carried(coefficients: np.ndarray, degrees: Sequence[int], others: Sequence[int]) -> np.ndarray:
+    """Coefficients of the same polynomials for other degrees: those of products that are new are 0."""
+    p, q = terms(degrees)
+    known = dict(zip([*p, *q], coefficients.tolist(), strict=True))
+    p, q = terms(others)
+    return np.array([known.get(entry, 0.0) for entry in [*p, *q]])
 
 
 class CompactModel(TransferModel):

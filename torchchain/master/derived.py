@@ -11,7 +11,6 @@ For any coefficients nothing is negative, rows add up to 1, T(0) = I, and withou
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -35,12 +34,13 @@ from torchchain.master.compact import (
 )
 from torchchain.master.compact_record import CompactReport, CompactSettings, drawn_again
 from torchchain.master.fits import linear_weights
-from torchchain.master.logistic import Regression, fit_points, solve, stepped
+from torchchain.master.logistic import BEYOND, Regression, fit_points, solve, stepped
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import Embedding, TransferModel
 from torchchain.master.proof import Certificate
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.sample import Sample
+from torchchain.master.uncertainty import later_times
 from torchchain.theory.ladder import Waves
 from torchchain.theory.law import Law
 from torchchain.theory.transfer import TheoryTransfer, described, transfer_of_law
@@ -55,9 +55,13 @@ SHORTEST, FEWEST_BANDS = 64, 8
 SOFT = 1e-3
 """Energies of a band below this share of its mean are taken up smoothly, so that none is negative: an ensemble's mean of
 definition "site" may be, by some 1e-4."""
+MOST_KEPT = 8
+"""Transfers of the theory that are kept: models of one ensemble are asked for the same times again and again."""
 RATE_TIMES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
 FIRST_ROOM = 0.02
 """Distances in wavenumber are counted in units of the width of a line, or of this."""
+
+_kept: dict[tuple[Ring, tuple[float, ...]], TheoryTransfer] = {}
 
 
 @dataclass(frozen=True)
@@ -80,19 +84,25 @@ class Ring:
     damping: float
 
 
-@functools.lru_cache(maxsize=8)
-def _derived(ring: Ring, times: tuple[float, ...]) -> TheoryTransfer:
+def _derived(ring: Ring, times: Tensor) -> TheoryTransfer:
+    """The theory's transfer at these times, increasing, or at more of them that were asked for before."""
+    for known, found in list(_kept.items()):
+        if known[0] == ring and bool(torch.isin(times, found.times).all()):
+            return found
+    while len(_kept) >= MOST_KEPT:
+        _kept.pop(next(iter(_kept)), None)
     law = Law(torch.tensor(ring.values, dtype=torch.float64), torch.tensor(ring.weights, dtype=torch.float64))
     waves = Waves.of_tones(ring.n_particles, ring.n_bands, ring.tones, ring.dual, ring.damping)
-    return transfer_of_law(law, waves, torch.tensor(times, dtype=torch.float64))
+    found = _kept[ring, tuple(times.tolist())] = transfer_of_law(law, waves, times)
+    return found
 
 
 def derived(ring: Ring, times: Tensor) -> Tensor:
     """T0 [source, time, receiver], nowhere negative; times may be infinite."""
     times = times.detach().cpu().double()
-    asked = sorted({*times[times.isfinite()].tolist(), 0.0})
-    found = _derived(ring, tuple(asked))
-    mean = found.mean[:, torch.searchsorted(found.times, times.clamp(max=asked[-1]))].clone()
+    asked = torch.cat([times[times.isfinite()], times.new_zeros(1)]).unique()
+    found = _derived(ring, asked)
+    mean = found.mean[:, torch.searchsorted(found.times, times.clamp(max=float(asked[-1])))].clone()
     mean[:, times.isinf()] = found.long_time[:, None]
     return _positive(mean, ring, times)
 
@@ -322,19 +332,18 @@ def check_corrected(scene: Scene | None) -> None:
 def _derive(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
     check_scene(sample.scene)
     assert sample.scene is not None, "checked"
-    return TheoryModel.of(sample.scene), None
+    model = TheoryModel.of(sample.scene)
+    end = sample.times[-1:]
+    if end > 0 and not sample.damped:  # all that a calibration asks for, at once
+        derived(model.ring, torch.cat([sample.times, end * end.new_tensor(BEYOND), later_times(float(end))]))
+    return model, None
 
 
 def _regression(sample: Sample, degrees: tuple[int, int, int]) -> tuple[Regression, TheoryModel]:
     assert sample.scene is not None, "checked"
     start = TheoryModel.of(sample.scene, degrees, torch.zeros(n_coefficients(degrees), dtype=torch.float64))
     times, data, weight = fit_points(sample.times, sample.mean, sample.long_time, sample.distance)
-    known = {t: i for i, t in enumerate(sample.times.tolist())}
-    whole = derived(start.ring, sample.times.double())  # at the times of the sample, where it is known from before
-    odds = torch.cat([
-        whole[:, [known[t] for t in times.tolist() if t in known]],
-        derived(start.ring, times[torch.tensor([t not in known for t in times.tolist()])]),
-    ], dim=1)  # fmt: skip
+    odds = derived(start.ring, times)
     return Regression.of_odds(odds, _shapes(start.ring, degrees), degrees, times, data, weight), start
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchchain.master.compact import (
     LARGEST_EXPONENT,
     CompactModel,
+    carried,
     checked_degrees,
     clock_of,
     polynomials,
@@ -28,6 +29,8 @@ FIT_TIMES = 48
 BEYOND = (1.5, 2.5, 5.0, 10.0, 30.0, 100.0, 1000.0)
 """Times after the last, in units of it, at which what has not settled is to have come nearer to Pi."""
 STEPS = 60
+FIRST_DAMPING = 1e-4
+"""Of the method's first step: from zero coefficients, too, steps of Gauss and Newton lead down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +147,7 @@ def solve(
         return bent + sum(value for value, _ in each), [predicted for _, predicted in each]
 
     now, predicted = misfits(found)
-    damping, converged, steps = 1.0, False, 0
+    damping, converged, steps = FIRST_DAMPING, False, 0
     while steps < STEPS:
         steps += 1
         square, pull = _joint(regressions, mixing, found, predicted, stiff)
@@ -288,7 +291,7 @@ def fit_compact(
 
     Args:
         rates: Q of the linear procedure, kept for comparison.
-        near: a model of the same degrees to start from.
+        near: a model to start from, of these degrees or others.
         progress: called with 1 after each step.
         waves, degrees, times, mean, long_time, distance, left: see :func:`regression`.
 
@@ -303,8 +306,8 @@ def fit_compact(
     degrees = checked_degrees(degrees)
     problem = regression(waves, degrees, times, mean, long_time, distance, left)
     start = None
-    if near is not None and near.degrees_ == degrees:
-        start = near.coefficients.detach().double().cpu().numpy()[None]
+    if near is not None:
+        start = carried(near.coefficients.detach().double().cpu().numpy(), near.degrees_, degrees)[None]
     found, report = solve([problem], np.ones((1, 1)), start, progress)
     model = CompactModel(
         rates=rates, degrees=torch.tensor(degrees, dtype=torch.float64), coefficients=torch.from_numpy(found[0]),

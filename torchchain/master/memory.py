@@ -115,6 +115,11 @@ class MemoryModel(TransferModel):
         return kept + self.amplitudes[1:].numel() + len(self.decay) + 2 * len(self.pair_decay)
 
     @property
+    def order(self) -> Order:
+        """Numbers of exponentials and of pairs."""
+        return len(self.decay), len(self.pair_decay)
+
+    @property
     def conservation_defect(self) -> float:
         """Largest share of energy that a source gains or loses at any time: the row sums of Pi - I and of all A_m."""
         leak = (self.basis.sum(-1) - 1).abs() + self.amplitudes.sum(-1).abs().sum(0)
@@ -122,7 +127,7 @@ class MemoryModel(TransferModel):
 
     @property
     def words(self) -> str:
-        return f"order ({len(self.decay)}, {len(self.pair_decay)}), {self.n_parameters} fitted numbers"
+        return f"order {self.order}, {self.n_parameters} fitted numbers"
 
     def functions(self, times: Tensor) -> Tensor:
         """f_m at each time, (time, function)."""
@@ -263,7 +268,7 @@ def _fit(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: P
     with single_blas_thread():
         tensors, report = fit_memory(
             sample.times, sample.mean, basis, order, leading=sample.leading, progress=progress,
-            near=near if isinstance(near, MemoryModel) else None,
+            near=near if isinstance(near, MemoryModel) and near.order == checked_order(order, len(sample.times)) else None,
         )  # fmt: skip
     return MemoryModel(rates=rates, **tensors), report
 

@@ -17,7 +17,14 @@ from torchchain.master.model import TransferModel
 from torchchain.master.records import Progress, Recipe
 from torchchain.master.report import Rung, Selection
 from torchchain.master.sample import Sample, decade_weights, exact_basis
+from torchchain.master.uncertainty import kept_times
 
+AS_GOOD = 1.1
+"""Foreseen distance, over that of the nearest model, of a smaller one that takes its place."""
+LARGE = 500
+"""Fitted numbers beyond which a model is tried only where no smaller one will do."""
+SEEN = 128
+"""Times at which models are compared with the half that they have not seen."""
 ENOUGH = 1.05
 """Distance of a model that is as good as the ensemble, over that of two halves, which is itself uncertain by some per cent."""
 
@@ -38,11 +45,15 @@ def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
             continue
         fit = record.fit(record.climbed_by)
         for settings in record.rungs(len(transfer.times)):
-            size = record.size(transfer.n_bands, damped, settings)
-            found.append((size, replace(asked, model=record, fit=fit, settings=settings)))
-    ordered = [recipe for _, recipe in sorted(found, key=lambda entry: entry[0])]
+            found.append(replace(asked, model=record, fit=fit, settings=settings))
+    ordered = sorted(found, key=lambda recipe: _size(recipe, transfer))
     sure = [recipe for recipe in ordered if recipe.model is not None and recipe.model.never_negative]
     return sure if damped and sure else ordered
+
+
+def _size(recipe: Recipe, transfer: BandTransfer) -> int:
+    assert recipe.model is not None, "a rung names its model"
+    return recipe.model.size(transfer.n_bands, transfer.damping > 0, recipe.settings)
 
 
 def select(
@@ -50,9 +61,10 @@ def select(
 ) -> tuple[Recipe, Selection, TransferModel | None]:
     """The first rung that, fitted on every other block, predicts the rest as well as the fitted blocks' means do.
 
-    As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time is taken if,
-    fitted to all blocks, it is foreseen to be within ``near`` times the noise in every one. If none is, the nearest is
-    taken. Models with rates are tried with procedure L.
+    As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time will do if,
+    fitted to all blocks, it is foreseen to be within ``near`` times the noise in every one, and is taken if no larger
+    one of its like is foreseen to be nearer by more than a tenth. If none will do, the nearest is taken. Models with
+    rates are tried with procedure L.
 
     Returns:
         The recipe of the rung, what was tried, and the model fitted to half of the blocks.
@@ -63,49 +75,59 @@ def select(
         return _untested(candidates), Selection("largest: too few blocks of realizations to hold some out"), None
     even = (torch.arange(blocks) + 1) % 2
     parts = Sample.of_blocks(transfer, even), Sample.of_blocks(transfer, 1 - even)
-    halves = total_variation(parts[0].mean, parts[1].mean).mean(0)
-    weight = decade_weights(transfer.times)
+    seen = kept_times(transfer.times, SEEN)
+    times, means = transfer.times[seen], [part.mean[:, seen] for part in parts]
+    halves = total_variation(*means).mean(0)
+    weight = decade_weights(times)
     noise = float(halves @ weight)
     tried: list[Rung] = []
     models: list[TransferModel] = []
     chosen: list[Recipe] = []
-    enough = False
+    enough: dict[int, float] = {}  # foreseen distance of those that will do, by their place among the tried
     refused: checks.FieldError | None = None
 
     def fitted(recipe: Recipe, sample: Sample, near: TransferModel | None = None) -> tuple[TransferModel, Tensor]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FitWarning)
             model, _ = recipe.run(sample, near, progress)
-        return model, model.transfer(transfer.times).detach()
+        return model, model.transfer(times).detach()
 
     for candidate in candidates:
         record = candidate.model
         assert record is not None, "a rung names its model"
+        if enough and (not record.windows or _size(candidate, transfer) > LARGE):
+            continue
         try:
-            model, found = fitted(candidate, parts[0])
+            like = next((m for m in models[::-1] if record.windows and isinstance(m, record.kind)), None)
+            model, found = fitted(candidate, parts[0], like)
         except checks.FieldError as error:  # of half of the data no model of this kind can be made
             refused = error
             continue
         chosen.append(candidate)
-        missed = total_variation(found, parts[1].mean).mean(0)
+        missed = total_variation(found, means[1]).mean(0)
         tried.append(Rung(record.name, candidate.order, float(missed @ weight)))
         models.append(model)
         if not record.windows:
-            enough = tried[-1].distance <= ENOUGH * noise
+            if tried[-1].distance <= ENOUGH * noise:
+                enough[len(tried) - 1] = 1.0
+                break
         elif foreseen(halves, missed, halves) @ weight <= record.near:  # not sure to be too far off
             _, other = fitted(candidate, parts[1], model)
-            back = total_variation(other, parts[0].mean).mean(0)
+            back = total_variation(other, means[0]).mean(0)
             both, spread = (missed + back) / 2, total_variation(found, other).mean(0)
-            enough = all(
-                float(foreseen(*(part[window].mean() for part in (halves, both, spread)))) <= record.near
-                for window in windows(transfer.times, record.windows)
-            )
-        if enough:
-            break
+            ahead = [
+                float(foreseen(*(part[window].mean() for part in (halves, both, spread))))
+                for window in windows(times, record.windows)
+            ]
+            if max(ahead) <= record.near:
+                enough[len(tried) - 1] = sum(ahead) / len(ahead)
     if not tried:
         assert refused is not None, "there is at least one candidate"
         raise refused
-    best = len(tried) - 1 if enough else min(range(len(tried)), key=lambda i: tried[i].distance)
+    if enough:
+        best = min(i for i, distance in enough.items() if distance <= AS_GOOD * min(enough.values()))
+    else:
+        best = min(range(len(tried)), key=lambda i: tried[i].distance)
     reached = "reaches" if enough else "comes nearest to"
     reason = f"smallest model that {reached} the distance of the two halves of the ensemble"
     return chosen[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best]

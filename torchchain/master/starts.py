@@ -246,7 +246,8 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
                 for which, times, data, error in told
                 if len(which)
             ]
-            found, _ = solve(problems, np.ones((len(problems), 1)))
+            first = coefficients.get(KINDS[0])  # kicks from the coefficients of waves released at rest
+            found, _ = solve(problems, np.ones((len(problems), 1)), None if first is None else first.numpy()[None])
             coefficients[kind] = torch.from_numpy(found[0])
     none = torch.zeros(0, dtype=torch.float64)
     return StartModel(

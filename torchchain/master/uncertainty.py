@@ -177,15 +177,23 @@ def _replicas(transfer: BandTransfer, recipe: Recipe, model: TransferModel, repe
         yield other
 
 
-def kept_times(times: Tensor) -> Tensor:
-    """Indices of at most MOST_TIMES of the times, first and last among them: half of them evenly by number, half by logarithm."""
+def kept_times(times: Tensor, most: int = MOST_TIMES) -> Tensor:
+    """Indices of at most ``most`` of the times, first and last among them: half of them evenly by number, half by logarithm."""
     count = len(times)
-    if count <= MOST_TIMES:
+    if count <= most:
         return torch.arange(count)
-    even = torch.linspace(0, count - 1, MOST_TIMES // 2, dtype=torch.float64).round().long()
+    even = torch.linspace(0, count - 1, most // 2, dtype=torch.float64).round().long()
     used = times[times > 0]
-    wanted = torch.logspace(math.log10(float(used[0])), math.log10(float(used[-1])), MOST_TIMES // 2, dtype=times.dtype)
+    wanted = torch.logspace(math.log10(float(used[0])), math.log10(float(used[-1])), most // 2, dtype=times.dtype)
     return torch.cat([even, torch.searchsorted(times, wanted).clamp(max=count - 1)]).unique()
+
+
+def later_times(end: float) -> Tensor:
+    """Times beyond the last at which :func:`horizon` looks, (48,)."""
+    return torch.cat([
+        torch.linspace(end, 2 * end, 24, dtype=torch.float64),
+        end * torch.logspace(0.35, math.log10(AHEAD), 24, dtype=torch.float64),
+    ])  # fmt: skip
 
 
 def horizon(transfer: BandTransfer, model: TransferModel) -> float:
@@ -201,9 +209,8 @@ def horizon(transfer: BandTransfer, model: TransferModel) -> float:
     late = transfer.times > 0.75 * end
     noise = 2 * float(statistical_distance(transfer.stderr[:, late]).mean())
     settled = float(total_variation(transfer.mean[:, late], transfer.long_time[:, None]).mean())
-    later = torch.cat([torch.linspace(end, 2 * end, 24), end * torch.logspace(0.35, math.log10(AHEAD), 24)])
     try:
-        foreseen = model.transfer(later.to(transfer.times)).detach()
+        foreseen = model.transfer(later_times(end).to(transfer.times)).detach()
     except checks.FieldError:  # rates that rounding has blurred by then
         return end
     if not bool(foreseen.isfinite().all()):

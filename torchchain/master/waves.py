@@ -9,8 +9,10 @@ which start as t^4 and end as a Lorentzian. w and g are those of the self-consis
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +28,12 @@ TONES = 8
 SERIES = 0.1
 """Up to this time D is summed in powers of t, beyond as it stands: differences of cosines lose digits at first."""
 SERIES_ORDER = 14
+LARGEST_KEPT, MOST_KEPT = 2**21, 8
+"""Numbers behind an answer of :func:`first_odds` that is kept, and such answers."""
 WIDTH = 0.8
 """Decay rates in D, relative to the Born approximation's: with the distance in these units the rest is smoothest."""
+
+_kept: dict[tuple[Any, ...], Tensor] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,22 +64,26 @@ class Waves:
             other = scene.stiffness_disorder
             strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
         strength = checks.number("strength", strength, above=0)
-        n, bands = scene.n_particles, scene.n_bands
-        width = n // 2 // bands
-        inside = np.arange(width) if width <= TONES else (np.arange(TONES) + 0.5) * width / TONES - 0.5
-        tones = np.arange(bands)[:, None] * width + inside + 1
-        source = poles(2 * np.sin(np.pi / n * np.array(scene.tones, dtype=float)), strength)
-        receiver = poles(2 * np.sin(np.pi / n * tones), strength)
-        coupling = strength**2 / n * width / len(inside)
-        found = (source.real, -WIDTH * source.imag, receiver.real, -WIDTH * receiver.imag)
-        frequency, decay, others, other_decay = (torch.from_numpy(value.copy()) for value in found)
-        return cls(frequency, decay, others, other_decay, torch.tensor(coupling, dtype=torch.float64))
+        return _of(scene.n_particles, scene.n_bands, tuple(scene.tones), strength)
 
     def tensors(self) -> dict[str, Tensor]:
         return {
             "source_frequency": self.source_frequency, "source_decay": self.source_decay,
             "tone_frequency": self.tone_frequency, "tone_decay": self.tone_decay, "coupling": self.coupling,
         }  # fmt: skip
+
+
+@functools.lru_cache(maxsize=16)
+def _of(n: int, bands: int, numbers: tuple[int, ...], strength: float) -> Waves:
+    width = n // 2 // bands
+    inside = np.arange(width) if width <= TONES else (np.arange(TONES) + 0.5) * width / TONES - 0.5
+    tones = np.arange(bands)[:, None] * width + inside + 1
+    source = poles(2 * np.sin(np.pi / n * np.array(numbers, dtype=float)), strength)
+    receiver = poles(2 * np.sin(np.pi / n * tones), strength)
+    coupling = strength**2 / n * width / len(inside)
+    found = (source.real, -WIDTH * source.imag, receiver.real, -WIDTH * receiver.imag)
+    frequency, decay, others, other_decay = (torch.from_numpy(value.copy()) for value in found)
+    return Waves(frequency, decay, others, other_decay, torch.tensor(coupling, dtype=torch.float64))
 
 
 def poles(frequency: np.ndarray, strength: float) -> np.ndarray:
@@ -92,7 +102,26 @@ def poles(frequency: np.ndarray, strength: float) -> np.ndarray:
 
 
 def first_odds(waves: Waves, times: Tensor, sources: Tensor) -> Tensor:
-    """D [source, time, receiver], positive, of some sources; times may be infinite."""
+    """D [source, time, receiver], positive, of some sources; times may be infinite.
+
+    Models of one ensemble are asked for the same times again and again: the latest answers are kept.
+    """
+    given = (*waves.tensors().values(), times, sources)
+    size = len(sources) * len(times) * waves.tone_frequency.numel()
+    if size > LARGEST_KEPT or any(value.requires_grad or value.device.type != "cpu" for value in given):
+        return _odds(waves, times, sources)
+    try:
+        key = tuple((value.dtype, tuple(value.shape), value.detach().numpy().tobytes()) for value in given)
+    except RuntimeError:  # inside torch.func's transforms no number has a value of its own
+        return _odds(waves, times, sources)
+    if key not in _kept:
+        while len(_kept) >= MOST_KEPT:
+            _kept.pop(next(iter(_kept)), None)
+        _kept[key] = _odds(waves, times, sources)
+    return _kept[key]
+
+
+def _odds(waves: Waves, times: Tensor, sources: Tensor) -> Tensor:
     w, g = waves.source_frequency[sources][:, None, None, None], waves.source_decay[sources][:, None, None, None]
     other, decay = waves.tone_frequency[:, :, None], waves.tone_decay[:, :, None]  # [receiver, tone, time]
     return (waves.coupling * scattered(w, other, g + decay, times)).sum(2).transpose(1, 2)
