@@ -111,9 +111,14 @@ class NonlinearMasterEquation:
             raise checks.fail(
                 "initial", f"have {self.linear.n_bands} bands on its last axis", f"shape {tuple(start.shape)}"
             )
+        return self.joined(start, moved, times, energy_per_particle, **options)
+
+    def joined(self, start: Tensor, moved: Tensor, times: Any, energy_per_particle: float, **options: Any) -> Tensor:
+        """What :meth:`solve` returns, from the linear transfer at the given times, [source, time, receiver]."""
         before = (start @ self.spectrum)[..., None, :]
         later = self.triads.solve(before[..., 0, :] * energy_per_particle, times, **options) / energy_per_particle
-        kept = torch.where(before > 0, later / before, 1.0).clamp(max=1)
+        there = before > 0
+        kept = torch.where(there, later / torch.where(there, before, 1.0), 1.0).clamp(max=1)
         linear = torch.einsum("...s,...ts,stk->...tk", start, kept @ self.spectrum.T, moved)
         return linear + (later - kept * before) @ self.shapes
 
