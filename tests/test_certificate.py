@@ -163,6 +163,6 @@ def test_taylor_coefficients_are_those_of_the_transfer():
     model = oscillating(0.1, 0.05, 1.3)
     parts = Exponentials.of(model)
     powers = 0.7 ** np.arange(17)
-    found = parts.taylor(2.0, 1.0) @ powers
+    (found,) = (parts.taylor(np.array([2.0]), np.array([1.0])) @ powers).T
     expected = model.transfer(torch.tensor([2.7], dtype=torch.float64))[:, 0].flatten().numpy()
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +26,9 @@ DEGREE = 16
 REMAINDER = 1e-15
 MOST_INTERVALS = 20_000
 DEEPEST, MOST_ROWS = 40, 10**5
-"""Halvings of an interval, and pieces of it, before the proof is given up."""
+"""Halvings of an interval, and pieces of some intervals, before the proof is given up."""
+NUMBERS = 2**17
+"""Taylor coefficients of all entries in the intervals that are looked at together."""
 ONSET = 4
 """Derivatives at t = 0, from the zeroth, that are exact: T(t) = I + O(t^4), as for a chain released from rest."""
 MARGIN = 1e-3
@@ -103,13 +104,14 @@ class Exponentials:
             weight[rests].sum(0).real, weight[~rests], np.minimum(poles[~rests].real, 0) + 1j * poles[~rests].imag
         )
 
-    def taylor(self, start: float, length: float, entries: Any = slice(None)) -> np.ndarray:
-        """Taylor coefficients about ``start`` in units of ``length``, (entry, degree + 1)."""
+    def taylor(self, start: np.ndarray, length: np.ndarray) -> np.ndarray:
+        """Taylor coefficients about every start, (interval,), in units of its length, (entry, interval, degree + 1)."""
         orders = np.arange(DEGREE + 1)
-        powers = (self.pole[:, None] * length) ** orders / [math.factorial(k) for k in orders]
-        weight = self.weight[:, entries] * np.exp(self.pole * start)[:, None]
-        found = (weight.T @ powers).real
-        found[:, 0] += self.level[entries]
+        factorials = np.array([math.factorial(k) for k in orders], dtype=float)
+        powers = (self.pole[:, None, None] * length[:, None]) ** orders / factorials
+        moved = np.exp(self.pole[:, None] * start)[..., None] * powers
+        found = (self.weight.T @ moved.reshape(len(self.pole), -1)).real.reshape(-1, *moved.shape[1:])
+        found[..., 0] += self.level[:, None]
         return found
 
     def size(self, start: float) -> np.ndarray:
@@ -172,8 +174,11 @@ def _bounded(parts: Exponentials, drift: float) -> Certificate:
     edges, tail = _edges(parts)
     lower = float((parts.level - parts.size(tail)).min())
     upper = float((parts.level + parts.size(tail)).max())
-    for start, end in pairwise(edges):
-        low, high = _bounds(parts, start, end - start)
+    start, length = np.array(edges[:-1]), np.diff(edges)
+    together = max(1, NUMBERS // (len(parts.level) * (DEGREE + 1)))
+    for first in range(0, len(start), together):
+        these = slice(first, first + together)
+        low, high = _bounds(parts, start[these], length[these])
         lower, upper = min(lower, low), max(upper, high)
     return Certificate(lower, upper, drift, tail, len(edges) - 1)
 
@@ -210,29 +215,30 @@ def _edges(parts: Exponentials) -> tuple[list[float], float]:
     return edges, edges[-1]
 
 
-def _bounds(parts: Exponentials, start: float, length: float) -> tuple[float, float]:
-    """Lower and upper bound of all entries in an interval."""
-    reach = np.abs(parts.pole) * length
+def _bounds(parts: Exponentials, start: np.ndarray, length: np.ndarray) -> tuple[float, float]:
+    """Lower and upper bound of all entries in some intervals of these starts and lengths, (interval,)."""
+    reach = np.abs(parts.pole)[:, None] * length
     series = sum(reach**k / math.factorial(k) for k in range(DEGREE + 1))
-    growth = np.exp(parts.pole.real * start) * series
-    extra = REMAINDER + 8 * np.finfo(float).eps * (np.abs(parts.level) + np.abs(parts.weight).T @ growth)
-    rows = parts.taylor(start, length) @ _BERNSTEIN
-    high = float((rows.max(1) + extra).max())
-    open_ = rows.min(1) - extra < -ROUNDING
-    low = float((rows.min(1) - extra)[~open_].min(initial=math.inf))
-    rows, extra = rows[open_], extra[open_]
-    for _ in range(DEEPEST):
-        if not len(rows):
-            return low, high
-        ends = np.minimum(rows[:, 0], rows[:, -1]) - extra
-        if float(ends.min()) < -ROUNDING or len(rows) > MOST_ROWS:  # values of T itself: no proof can come
-            return min(low, float((rows.min(1) - extra).min())), high
-        rows, extra = np.concatenate([rows @ _LEFT, rows @ _RIGHT]), np.concatenate([extra, extra])
+    growth = np.exp(parts.pole.real[:, None] * start) * series
+    size = np.abs(parts.level)[:, None] + np.abs(parts.weight).T @ growth
+    extra = (REMAINDER + 8 * np.finfo(float).eps * size).ravel()
+    rows = (parts.taylor(start, length) @ _BERNSTEIN).reshape(-1, DEGREE + 1)
+    interval = np.tile(np.arange(len(start)), len(parts.level))
+    high, low = float((rows.max(1) + extra).max()), math.inf
+    for deep in range(DEEPEST + 1):
         found = rows.min(1) - extra
-        open_ = found < -ROUNDING
+        # values of T itself are the ends: where one is negative, no proof can come
+        ends = np.minimum(rows[:, 0], rows[:, -1]) - extra
+        given_up = np.isin(interval, interval[ends < -ROUNDING])
+        if deep == DEEPEST or len(rows) > MOST_ROWS:
+            given_up[:] = True
+        open_ = (found < -ROUNDING) & ~given_up
         low = min(low, float(found[~open_].min(initial=math.inf)))
-        rows, extra = rows[open_], extra[open_]
-    return min(low, float((rows.min(1) - extra).min(initial=math.inf))), high
+        if not open_.any():
+            break
+        rows, extra, interval = rows[open_], np.tile(extra[open_], 2), np.tile(interval[open_], 2)
+        rows = np.concatenate([rows @ _LEFT, rows @ _RIGHT])
+    return low, high
 
 
 @dataclass(frozen=True, eq=False)
