@@ -43,7 +43,7 @@ class Config(harness.Ensemble):
     """time step of the comparison, after some earlier times"""
 
 
-SMOKE = Config(n_particles=64, n_bands=8, realizations=32, fresh=16, stop=40.0, step=1.0, output_step=4.0)
+SMOKE = Config(n_particles=64, n_bands=8, realizations=8, fresh=8, stop=20.0, step=1.0, output_step=4.0)
 
 
 def calibrating(config: Config) -> tc.Scene:

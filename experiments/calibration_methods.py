@@ -34,7 +34,7 @@ class Config(Ensemble):
     """at most"""
 
 
-SMOKE = Config(n_bands=16, realizations=4, stop=5.0, adam_steps=5)
+SMOKE = Config(n_particles=32, n_bands=4, realizations=4, stop=5.0, adam_steps=2)
 
 
 def candidates(config: Config) -> list[tuple[str, str, str, dict[str, Any]]]:

@@ -77,7 +77,7 @@ class Config:
     """seconds of a run after which no finer one of the method follows"""
 
 
-SMOKE = Config(waves=(QUICK,), repeats=1, longest=0.02)
+SMOKE = Config(waves=(QUICK,), repeats=1, longest=0.002)
 
 
 @dataclass(frozen=True)

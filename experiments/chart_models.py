@@ -50,7 +50,7 @@ class Config(Ensemble):
     """timed predictions after a first"""
 
 
-SMOKE = Config(n_particles=32, realizations=4, stop=5.0, bands=(4, 8), largest_search=4, adam_steps=3, repeats=1)
+SMOKE = Config(n_particles=32, realizations=4, stop=5.0, bands=(4,), largest_search=4, adam_steps=2, repeats=1)
 
 
 def candidates(config: Config, n_bands: int) -> Iterator[tuple[str, str, str, dict[str, Any]]]:

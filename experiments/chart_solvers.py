@@ -55,7 +55,7 @@ class Config(Ensemble):
 
 
 SMOKE = Config(
-    n_particles=32, n_bands=4, realizations=2, stop=5.0, faster=100.0, until=5.0, stiff_until=0.1, outputs=3, repeats=1, longest=0.02
+    n_particles=32, n_bands=4, realizations=2, stop=5.0, faster=100.0, until=5.0, stiff_until=0.1, outputs=3, repeats=1, longest=0.002
 )  # fmt: skip
 
 

@@ -45,7 +45,7 @@ class Config:
     """values at which every badness is drawn"""
 
 
-SMOKE = Config(halvings=5, points=3)
+SMOKE = Config(halvings=2, points=2)
 
 
 @dataclass(frozen=True)

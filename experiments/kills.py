@@ -22,7 +22,6 @@ from safetensors.torch import load_file
 from torchchain import checks, cli
 from torchchain.ensemble.statistics import EnsembleMoments, joined
 
-COMMANDS = ("simulate", "calibrate")
 N_BLOCKS = {"simulate": 1, "calibrate": 20}
 
 
@@ -30,8 +29,10 @@ N_BLOCKS = {"simulate": 1, "calibrate": 20}
 class Config:
     seed: int = 0
     """seed of the ensembles and of the moments of the kills"""
+    commands: tuple[str, ...] = tuple(N_BLOCKS)
+    """the commands that are killed"""
     kills: int = 100
-    """kills in all, half of them of each command"""
+    """kills in all, as many of each command"""
     realizations: int = 600
     """chains of an ensemble"""
     n_particles: int = 64
@@ -44,7 +45,7 @@ class Config:
     """seconds between saves"""
 
 
-SMOKE = Config(kills=2, realizations=60, n_particles=32, n_bands=4, stop=5.0, every=0.0)
+SMOKE = Config(commands=("calibrate",), kills=1, realizations=40, n_particles=16, n_bands=2, stop=3.0, every=0.0)
 
 
 def arguments(config: Config, command: str, out: Path) -> list[str]:
@@ -59,7 +60,7 @@ def arguments(config: Config, command: str, out: Path) -> list[str]:
 
 
 SERVER = multiprocessing.get_context("forkserver")  # forks processes that hold the libraries already
-SERVER.set_forkserver_preload(["torchchain.cli.dispatch", "torchchain.evolvers.stencil", "__main__"])
+SERVER.set_forkserver_preload(["torchchain.cli.dispatch", "torchchain.evolvers.stencil", "matplotlib.backends.backend_agg", "xarray", "__main__"])
 
 
 def _run(command: list[str]) -> None:
@@ -108,21 +109,23 @@ def contents(out: Path) -> dict[str, bytes]:
 def measure(config: Config, device: str) -> xarray.Dataset:
     if device != "cpu" or not hasattr(os, "fork"):
         raise checks.fail("device", "be 'cpu', on a system that can fork", device)
-    if config.kills < 2:
-        raise checks.fail("kills", "be at least 2", config.kills)
+    for command in config.commands:
+        checks.choice("commands", command, N_BLOCKS)
+    if config.kills < len(config.commands):
+        raise checks.fail("kills", "be at least one of each command", config.kills)
     random = np.random.default_rng(config.seed)
     kills: list[tuple[float, ...]] = []
     jobs: list[tuple[float, ...]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        for command in COMMANDS if config != SMOKE else ():  # the first processes load what is loaded late
+        for command in config.commands if config != SMOKE else ():  # the first processes load what is loaded late
             ended(begun(arguments(SMOKE, command, Path(scratch) / "first")), 3600.0)
-        for index, command in enumerate(COMMANDS):
+        for index, command in enumerate(config.commands):
             whole = Path(scratch) / command
             begin = time.monotonic()
             if not ended(begun(arguments(config, command, whole)), 3600.0):
                 raise RuntimeError("the undisturbed run took more than an hour")
             duration, reference = time.monotonic() - begin, contents(whole)
-            wanted = len(kills) + config.kills // 2
+            wanted = len(kills) + config.kills // len(config.commands)
             while len(kills) < wanted:
                 out, before = Path(scratch) / f"{command}-{len(jobs)}", len(kills)
                 while True:
@@ -153,7 +156,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             "clean": ("job", j[3].astype(int), {"long_name": "whether nothing but the results is left"}),
             "undisturbed": ("job", j[4], {"units": "s", "long_name": "time of the undisturbed run"}),
         },
-        attrs={"commands": " ".join(COMMANDS)},
+        attrs={"commands": " ".join(config.commands)},
     )
 
 
@@ -165,7 +168,7 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
         Row("of these that left nothing but their results", int(data.clean.sum())),
         Row("most kills of one run", int(data.job_kills.max())),
     ]
-    for index, command in enumerate(COMMANDS):
+    for index, command in enumerate(config.commands):
         here = data.kill_command == index
         lost, size = data.lost.values[here], data["size"].values[here]
         rows += [
@@ -181,7 +184,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     figure, axes = harness.panels(1, 2)
     lost, kept = axes[0]
     edges = np.linspace(0, max(1e-3, float(data.lost.max())) * 1.001, 25)
-    for index, command in enumerate(COMMANDS):
+    for index, command in enumerate(config.commands):
         values = data.lost.values[data.kill_command == index]
         lost.hist(values, edges, alpha=0.6, color=f"C{index}", label=f"{command}, {len(values)} kills")
         first = True

@@ -72,8 +72,8 @@ class Config:
 
 
 SMOKE = Config(
-    realizations=8, fresh_realizations=8, strengths=(0.1, 0.3, 0.5), unseen=(0.2,), n_particles=32, n_bands=4,
-    others=("48/4",), other_realizations=4, stop=20.0, mixtures=2, adam_steps=2,
+    realizations=4, fresh_realizations=4, strengths=(0.1, 0.3), unseen=(0.2,), n_particles=32, n_bands=4,
+    others=("48/4",), other_realizations=2, stop=20.0, mixtures=2, adam_steps=2,
 )  # fmt: skip
 
 
