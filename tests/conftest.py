@@ -14,6 +14,8 @@ import torchchain as tc
 from torchchain import cli
 from torchchain.cli import outputs
 
+RENDERED = outputs.figure
+
 
 @pytest.fixture(autouse=True, scope="session")
 def one_thread():
@@ -58,7 +60,23 @@ def run(tmp_path, monkeypatch, capsys):
     return command
 
 
+@pytest.fixture(autouse=True, scope="session")
+def figures_unrendered():
+    """Figures are made but not rendered, which takes longer than all the rest of a small run, unless ``rendered`` is asked for."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
+        yield
+
+
+@pytest.fixture(scope="module")
+def rendered_here():
+    """For what a module shares."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outputs, "figure", RENDERED)
+        yield
+
+
 @pytest.fixture
-def no_drawing(monkeypatch):
-    """Figures are made but not rendered, which takes longer than all the rest of a small run."""
-    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
+def rendered(monkeypatch):
+    """Figures as a user has them."""
+    monkeypatch.setattr(outputs, "figure", RENDERED)

@@ -120,7 +120,7 @@ def killed_at(owner, name, count, after):
     setattr(owner, name, deadly)
 
 
-MOMENTS = [
+MOMENTS = [  # the first four are of the checkpoint alone, whatever the command
     pytest.param("os", "replace", 0, False, id="before the first part appears"),
     pytest.param("os", "replace", 7, False, id="before a part is replaced"),
     pytest.param("os", "replace", 7, True, id="after a part is replaced"),
@@ -145,9 +145,11 @@ def reference(tmp_path_factory):
     return found
 
 
-@pytest.mark.parametrize(("owner", "name", "count", "after"), MOMENTS)
-@pytest.mark.parametrize("command", ["simulate", "calibrate"])
-@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize(
+    ("command", "owner", "name", "count", "after"),
+    [pytest.param("simulate", *moment.values, id=f"simulate-{moment.id}") for moment in MOMENTS]
+    + [pytest.param("calibrate", *moment.values, id=f"calibrate-{moment.id}") for moment in MOMENTS[4:]],
+)
 def test_killed_and_resumed(command, owner, name, count, after, reference, tmp_path):
     arguments = [command, *COMMANDS[command], *EVERY, "--out", str(tmp_path / "out")]
     assert forked(arguments, partial(killed_at, owner, name, count, after)) == -signal.SIGKILL
@@ -162,7 +164,6 @@ def test_killed_and_resumed(command, owner, name, count, after, reference, tmp_p
         assert record["resumed_realizations"] == 40
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_killed_again_and_again(reference, tmp_path):
     arguments = ["simulate", *FLAGS, *EVERY, "--out", str(tmp_path / "out")]
     for _ in range(3):
@@ -410,7 +411,6 @@ def test_a_full_disk_ends_no_run(whole, tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_no_room_for_the_results(reference, tmp_path):
     """With files limited to a kilobyte neither checkpoint nor results fit; nothing half-written stays."""
     arguments = ["simulate", *FLAGS, *EVERY, "--out", str(tmp_path / "out")]
@@ -422,7 +422,6 @@ def test_no_room_for_the_results(reference, tmp_path):
     assert data_of(tmp_path / "out") == reference["simulate"]
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_a_disk_that_fills_up_keeps_the_checkpoint(reference, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 

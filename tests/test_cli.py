@@ -30,6 +30,7 @@ def calibrated(tmp_path_factory):
 # What a run leaves behind
 
 
+@pytest.mark.usefixtures("rendered")
 def test_simulate(run, tmp_path):
     names = ["band_energy", "energy", "center", "long_time_band_energy"]
     status, output, errors = run("simulate", *SMALL, "--observables", *names, "--out", "here/there")
@@ -106,8 +107,8 @@ def test_calibrate(calibrated):
     ],
 )
 def test_corners_of_calibrate(run, arguments, drawn, request):
-    if not drawn:
-        request.getfixturevalue("no_drawing")
+    if drawn:
+        request.getfixturevalue("rendered")
     status, output, errors = run("calibrate", *SMALL, "--realizations", "3", *arguments, "--out", "out")
     assert (status, errors) == (0, "")
     assert "nan" not in output
@@ -119,7 +120,6 @@ def test_corners_of_calibrate(run, arguments, drawn, request):
 
 
 @pytest.mark.parametrize("command", ["simulate", "calibrate"])
-@pytest.mark.usefixtures("no_drawing")
 def test_the_resolved_config_makes_the_run_again(run, command):
     flags = {"simulate": [], "calibrate": ["--fit", "linear", "--window", "0.5", "3"]}[command]
     results = {"simulate": "results.nc", "calibrate": "transfer.nc"}[command]
@@ -148,7 +148,6 @@ def test_predict(run, calibrated):
     assert "2 starts, 3 times to 3, solved by expm" in output
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_predict_from_any_start_by_any_solver(run):
     # of a model that is a differential equation: others solve that of the nearest one with memory
     assert run("calibrate", *SMALL, "--realizations", "40", "--model", "memory", "--out", "memory")[0] == 0
@@ -166,7 +165,6 @@ def test_predict_from_any_start_by_any_solver(run):
         assert first.identical(second)
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_flags_override_the_file_and_the_file_the_defaults(run, tmp_path):
     (tmp_path / "scene.toml").write_text(
         "n_particles = 16\nn_bands = 4\nrealizations = 2\nseed = 9\n"
@@ -185,14 +183,12 @@ def test_flags_override_the_file_and_the_file_the_defaults(run, tmp_path):
     assert tomllib.load(open("out/config.toml", "rb"))["excitation"]["kind"] == "standing_wave"
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_flags_of_times_fill_up_a_list_in_the_file(run, tmp_path):
     (tmp_path / "scene.toml").write_text("times = [0.0, 7.0]\nn_particles = 16\nn_bands = 4\nrealizations = 1")
     assert run("simulate", "--config", "scene.toml", "--times.stop", "1", "--method", "modes", "--out", "out")[0] == 0
     assert tomllib.load(open("out/config.toml", "rb"))["times"] == {"start": 0.0, "stop": 1.0, "step": 0.25}
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_a_second_run_replaces_the_first(run, tmp_path):
     assert run("simulate", *SMALL, "--out", "out")[0] == 0
     (tmp_path / "out" / "notes.txt").write_text("mine")
@@ -202,7 +198,6 @@ def test_a_second_run_replaces_the_first(run, tmp_path):
     assert os.listdir(tmp_path) == ["out"]
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_seeds_matter(run):
     for seed in ("1", "2"):
         assert run("simulate", *SMALL, "--seed", seed, "--out", seed)[0] == 0

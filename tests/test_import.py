@@ -387,7 +387,6 @@ def written(columns, path, text=""):
     path.write_text(text)
 
 
-@pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize("kind", ["type", "radius"])
 def test_masses_by_flags(kind, run, tmp_path):
     """A dict of types, or a density; each of them one line where it is wrong."""
@@ -406,7 +405,6 @@ def test_masses_by_flags(kind, run, tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["run.dump", "run.nc"]
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_mercury_runs_by_the_command(run, tmp_path):
     """Masses from the .restart beside a run, a box that the user says is periodic, contacts from .fstat."""
     ring = scene(realizations=2).chain(range(2))
@@ -451,7 +449,6 @@ def test_mercury_runs_by_the_command(run, tmp_path):
     assert float(scaled.times[-1] / found.times[-1]) == pytest.approx(float(ring.masses.mean()) ** -0.5, rel=1e-9)
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_doubts_that_many_runs_share_are_told_once(run, tmp_path):
     """Damped runs of a chain that is said not to be, until the damping is named."""
     ring = scene(realizations=2).chain(range(2))
@@ -515,7 +512,6 @@ def test_import_calibrate_predict(run, tmp_path):
     assert found["total_variation"] == pytest.approx(float(expected), abs=1e-9)
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_an_import_is_made_again(run, tmp_path):
     """From any folder, to the last bit; in one line where a file has changed or is gone."""
     os.mkdir("runs")
@@ -544,7 +540,6 @@ def test_an_import_is_made_again(run, tmp_path):
     assert f"got no file {changed}" in errors
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_names_of_references(run, tmp_path):
     """{stem}, {name}, a folder of its own, and files that are not packed."""
     shutil.copy(DUMPS / "linear-1-1.dump.gz", tmp_path / "a.b.dump.gz")
@@ -570,7 +565,6 @@ def test_names_of_references(run, tmp_path):
             path.unlink()
 
 
-@pytest.mark.usefixtures("no_drawing")
 def test_units_of_mass_and_stiffness(run, tmp_path):
     """The same runs in other units: masses times 3, times times 2, stiffness 3 / 4, lengths as they are."""
     for run_number in (1, 2, 3):

@@ -52,7 +52,7 @@ def test_no_folder_is_no_place(out, calibrated, capsys):
     assert os.listdir() == []
 
 
-def test_a_finished_run_clears_what_dead_runs_left_and_nothing_else(no_drawing):
+def test_a_finished_run_clears_what_dead_runs_left_and_nothing_else():
     dead = subprocess.run(COMMAND + ["--version"], check=True, capture_output=True)  # noqa: RUF005
     assert dead.stdout.startswith(b"torchchain ")
     gone = ThreadPoolExecutor(1)  # a process that has ended, whose number is free
@@ -70,7 +70,7 @@ def test_a_finished_run_clears_what_dead_runs_left_and_nothing_else(no_drawing):
     assert sorted(os.listdir()) == sorted([*kept, "run"])
 
 
-def test_two_runs_into_one_folder(no_drawing, capsys, monkeypatch):
+def test_two_runs_into_one_folder(capsys, monkeypatch):
     def during(*arguments, **settings):
         errors = complaint(capsys, "simulate", *SMALL, "--out", "run")
         assert "out must be free, got run, where process " in errors
@@ -246,7 +246,7 @@ def test_the_folder_of_a_calibration(calibrated):
     assert "model.safetensors" in repr(run)
 
 
-def test_the_folder_of_a_simulation_and_of_a_prediction(calibrated, no_drawing):
+def test_the_folder_of_a_simulation_and_of_a_prediction(calibrated):
     assert cli.main(["simulate", *SMALL, "--observables", "center", "--out", "sim"]) == 0
     run = tc.open("sim")
     assert run.scene.observables == ("center",)
@@ -270,7 +270,7 @@ def test_folders_that_hold_no_run(path):
         tc.open(path)
 
 
-def test_prediction_from_the_folder_is_that_from_the_file(calibrated, no_drawing):
+def test_prediction_from_the_folder_is_that_from_the_file(calibrated):
     assert cli.main(["predict", str(calibrated), "--out", "a"]) == 0
     assert cli.main(["predict", str(calibrated / "model.safetensors"), "--out", "b"]) == 0
     assert tc.open("a").data.identical(tc.open("b").data)
@@ -280,7 +280,7 @@ def test_prediction_from_the_folder_is_that_from_the_file(calibrated, no_drawing
 # A transfer from a file
 
 
-def test_a_calibration_goes_on_from_a_transfer(calibrated, no_drawing, capsys):
+def test_a_calibration_goes_on_from_a_transfer(calibrated, capsys):
     for given in (calibrated, calibrated / "transfer.nc"):
         assert cli.main(["calibrate", "--transfer", str(given), "--out", "again"]) == 0
     assert open("again/model.safetensors", "rb").read() == open(calibrated / "model.safetensors", "rb").read()

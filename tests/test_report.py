@@ -48,7 +48,7 @@ def read(out):
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
+def runs(tmp_path_factory, rendered_here):
     """A small folder of every command that leaves a report."""
     top = tmp_path_factory.mktemp("reports")
     commands = {

@@ -18,22 +18,15 @@ SMALL = "--n-particles 16 --n-bands 4 --realizations 6 --times.stop 5 --seed 5".
 pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
 
 
-@pytest.fixture(autouse=True)
-def no_drawing(monkeypatch):
-    monkeypatch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """A run of each command; the ensembles by a plan, one with options of its own."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
         patch.setattr(planning, "plan", planned(planning.plan, "verlet", {"step": 0.05}))
         patch.chdir(folder)
         assert cli.main(["simulate", *SMALL, "--observables", "energy", "center", "--out", "simulate"]) == 0
         patch.undo()
-        patch.setattr(outputs, "figure", lambda drawn: lambda path: path.write_bytes(b""))
         patch.chdir(folder)
         assert cli.main(["calibrate", *SMALL, "--method", "modes", "--out", "calibrate"]) == 0
         assert (
