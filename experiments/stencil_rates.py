@@ -129,7 +129,7 @@ def impulse_updates(config: Config, frequency: float) -> tuple[float, float]:
 
     No more particles are counted than sound has reached, though the kernels go a little beyond.
     """
-    count = min(expansion.LONGEST, int(expansion.REACH / frequency))
+    count = min(expansion.LONGEST, int(expansion.SHARED_PHASE / frequency))
     terms = np.array([terms_at(frequency, 1.0 + j) for j in range(count)])
     reached = np.minimum(np.arange(0, config.stop, count), config.n_particles).sum()
     return reached * terms.max(), reached * 2 * terms.sum()

@@ -122,7 +122,7 @@ def test_file_keeps_the_certificate_and_load_verifies_it(memory, tmp_path):
     [
         ({"lower": 1e-3}, "certificate must hold for its model: lower 0.001"),
         ({"upper": 0.9}, "certificate must hold for its model: upper 0.9"),
-        ({"drift": -1.0}, "certificate must hold for its model: drift -1"),
+        ({"conservation_defect": -1.0}, "certificate must hold for its model: conservation_defect -1"),
         ({"lower": -0.5}, "report.certificate.lower must be at least -1e-12, got -0.5"),
         ({"lower": "none"}, "report.certificate.lower must"),
         ({"more": 1}, "report.certificate must have only the keys"),

@@ -64,7 +64,7 @@ def test_any_coefficients_make_shares_of_the_energy(size):
     found = model._at(times)
     assert bool(found.isfinite().all())
     assert float(found.min()) >= 0
-    assert float((found.sum(-1) - 1).abs().max()) <= model.certificate.drift
+    assert float((found.sum(-1) - 1).abs().max()) <= model.certificate.conservation_defect
     assert torch.equal(found[:, 0], torch.eye(B, dtype=torch.float64))
     certificate = certify(model)
     assert certificate.holds

@@ -9,7 +9,7 @@ import torch
 
 from torchchain.ensemble.observables import chosen_observables
 from torchchain.ensemble.scene import Scene
-from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, terms
+from torchchain.evolvers.expansion import LEAP, LONGEST, SHARED_PHASE, terms
 from torchchain.network import damped, modes
 
 EPS = 2.0**-53
@@ -99,7 +99,7 @@ class LatticeFacts:
     def _chebyshev(self, accuracy: float) -> float:
         products = sums = 0.0
         for phase in (self.top * self.gaps[self.gaps > 0]).tolist():
-            outputs = min(LONGEST, max(1, int(REACH / phase)))
+            outputs = min(LONGEST, max(1, int(SHARED_PHASE / phase)))
             leaps = math.ceil(phase / LEAP)
             whole = leaps * terms(phase / leaps if leaps > 1 else phase * outputs, accuracy)
             products += 2 * whole / outputs

@@ -17,7 +17,7 @@ from torchchain.ensemble.moving_part import moving_part
 from torchchain.ensemble.observables import chosen_observables, is_fused
 from torchchain.ensemble.scene import Scene
 from torchchain.evolvers import METHODS, Method
-from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, terms
+from torchchain.evolvers.expansion import LEAP, LONGEST, SHARED_PHASE, terms
 
 EPS = {torch.float64: 2.0**-53, torch.float32: 2.0**-24}
 SAMPLE = 2**17  # particles of the chains, and of the starts, that stand for the ensemble: some 20 ms
@@ -315,8 +315,8 @@ def _chebyshev(facts: Facts, accuracy: float) -> float:
     longest = 4.0
     for phase in z.tolist():
         leaps = math.ceil(phase / LEAP)
-        shared = phase <= REACH and len(gaps) > 1
-        outputs = min(LONGEST, max(1, int(REACH / phase)), len(gaps)) if shared else 1
+        shared = phase <= SHARED_PHASE and len(gaps) > 1
+        outputs = min(LONGEST, max(1, int(SHARED_PHASE / phase)), len(gaps)) if shared else 1
         whole = terms(phase / leaps if leaps > 1 else phase * outputs, accuracy)
         mean = terms(phase / leaps if leaps > 1 else phase * (outputs + 1) / 2, accuracy)
         # An impulse has no displacement and a wave no velocity at first, and later the mirrored states may be at hand.

@@ -7,9 +7,9 @@ import math
 # A stretch of time with z beyond this is crossed in equal leaps. Longer ones save little, as the degree is z / 2 and a
 # few, while rounding errors of the recursion grow with its degree.
 LEAP = 256.0
-# The outputs that follow a state until z exceeds REACH, at most LONGEST, share the kernels' recursion: the work per
+# The outputs that follow a state until z exceeds SHARED_PHASE, at most LONGEST, share the kernels' recursion: the work per
 # output, degree(z) stencils for all of them plus two sums each, is flat around this minimum.
-REACH = 24.0
+SHARED_PHASE = 24.0
 LONGEST = 8
 SEGMENTS = 1024
 ROUNDING = 2.0**-53

@@ -33,7 +33,7 @@ import numpy as np
 from torchchain.evolvers import kernels
 from torchchain.evolvers.coefficients import Tables, tabulate, top_order
 from torchchain.evolvers.compiling import kernel
-from torchchain.evolvers.expansion import LEAP, LONGEST, REACH
+from torchchain.evolvers.expansion import LEAP, LONGEST, SHARED_PHASE
 from torchchain.evolvers.records import (
     BOND_FIELDS,
     BOND_MOMENTS,
@@ -108,7 +108,7 @@ def propagate(
     longest_gap = times[0] - clock[begin, 2]
     for i in range(1, steps):
         longest_gap = max(longest_gap, times[i] - times[i - 1])
-    top = top_order(1.001 * max(REACH, min(LEAP, frequencies.max() * longest_gap)))
+    top = top_order(1.001 * max(SHARED_PHASE, min(LEAP, frequencies.max() * longest_gap)))
     table = np.zeros((5, LONGEST, 4 * (top // 8 + 1)))
     tables = Tables(
         np.zeros(LONGEST),
@@ -159,7 +159,7 @@ def propagate(
         leaps = 0  # equal ones that are still to be made to the next time
         i = 0
         while i < steps:
-            if since > 0 and (leaps > 0 or since >= LONGEST or frequency * (times[i] - anchor) > REACH):
+            if since > 0 and (leaps > 0 or since >= LONGEST or frequency * (times[i] - anchor) > SHARED_PHASE):
                 # The latest state becomes the anchor, and those before it follow in order.
                 reverse(u, here)
                 reverse(v, here)
@@ -174,7 +174,7 @@ def propagate(
                     while (
                         i + count < steps
                         and since + count < LONGEST
-                        and frequency * (times[i + count] - anchor) <= REACH
+                        and frequency * (times[i + count] - anchor) <= SHARED_PHASE
                     ):
                         count += 1
                     # Counted down, not up to a time: the rounding of many sums would add up.

@@ -149,10 +149,10 @@ def certify(model: TransferModel) -> Certificate:
         return given
     if not isinstance(model, MemoryModel):
         return _certify_rates(model)
-    return _bounded(Exponentials.of(model), _drift(model.basis, model.amplitudes))
+    return _bounded(Exponentials.of(model), _row_sums_off(model.basis, model.amplitudes))
 
 
-def _drift(basis: Tensor, amplitudes: Tensor) -> float:
+def _row_sums_off(basis: Tensor, amplitudes: Tensor) -> float:
     """Largest distance of a row sum of T from 1, at any time."""
     if not bool(basis.any()):  # damped chains
         return math.inf
@@ -165,11 +165,10 @@ def _certify_rates(model: TransferModel) -> Certificate:
         parts = Exponentials.of_embedding(model)
     except CertificateError:
         return Certificate(-math.inf, math.inf, math.inf, math.inf, 0)
-    drift = math.inf if bool(model.damping.any()) else model.conservation_defect
-    return _bounded(parts, drift)
+    return _bounded(parts, math.inf if bool(model.damping.any()) else model.conservation_defect)
 
 
-def _bounded(parts: Exponentials, drift: float) -> Certificate:
+def _bounded(parts: Exponentials, conservation_defect: float) -> Certificate:
     """Bounds of a sum of exponentials over all intervals of the time axis."""
     edges, tail = _edges(parts)
     lower = float((parts.level - parts.size(tail)).min())
@@ -180,18 +179,18 @@ def _bounded(parts: Exponentials, drift: float) -> Certificate:
         these = slice(first, first + together)
         low, high = _bounds(parts, start[these], length[these])
         lower, upper = min(lower, low), max(upper, high)
-    return Certificate(lower, upper, drift, tail, len(edges) - 1)
+    return Certificate(lower, upper, conservation_defect, tail, len(edges) - 1)
 
 
 def verify(model: TransferModel, certificate: Certificate) -> None:
     """Prove a model's certificate again.
 
     Raises:
-        CertificateError: if the model's energies go lower or higher, or drift more, than the certificate says.
+        CertificateError: if the model's energies go lower or higher, or rows are further from 1, than the certificate says.
     """
     checks.instance("certificate", certificate, Certificate)
     found = certify(model)
-    for name in ("lower", "upper", "drift"):
+    for name in ("lower", "upper", "conservation_defect"):
         said, now = getattr(certificate, name), getattr(found, name)
         worse = said - now if name == "lower" else now - said
         if not (now == said or worse <= ROUNDING):

@@ -20,14 +20,14 @@ class Certificate:
     Attributes:
         lower: no entry of T is below it.
         upper: none is above it.
-        drift: no row sum of T differs from 1 by more, infinity if T decays to zero (damped chains).
+        conservation_defect: no row sum of T differs from 1 by more, infinity if T decays to zero (damped chains).
         tail: from this time on Pi outweighs all that still decays.
         intervals: of the time axis before it, that were needed.
     """
 
     lower: float
     upper: float
-    drift: float
+    conservation_defect: float
     tail: float
     intervals: int
 
@@ -44,6 +44,7 @@ class Certificate:
     def from_dict(cls, record: Mapping[str, Any]) -> Certificate:
         """The inverse of :meth:`to_dict`, checked."""
         checks.instance("report.certificate", record, dict)
+        record = {"conservation_defect" if name == "drift" else name: value for name, value in record.items()}  # of old files
         names = [entry.name for entry in fields(cls)]
         checks.known_keys("report.certificate", record, names)
         values: dict[str, Any] = {}

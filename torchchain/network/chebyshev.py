@@ -24,7 +24,7 @@ from torchchain import checks
 from torchchain.chain import State
 from torchchain.evolvers.chebyshev import METHOD as CHAINS
 from torchchain.evolvers.chebyshev import check_work, later_times, rounded_up
-from torchchain.evolvers.expansion import LEAP, LONGEST, REACH, ROUNDING, SEGMENTS
+from torchchain.evolvers.expansion import LEAP, LONGEST, ROUNDING, SEGMENTS, SHARED_PHASE
 from torchchain.evolvers.method import Advance
 from torchchain.modes import phase
 from torchchain.network.layouts import Run, layout_of
@@ -196,7 +196,7 @@ class CompiledAdvance:
                 done += 1
                 continue
             count = 1
-            while count < LONGEST and done + count < len(times) and w * (times[done + count] - now) <= REACH:
+            while count < LONGEST and done + count < len(times) and w * (times[done + count] - now) <= SHARED_PHASE:
                 count += 1
             leaps = max(1, math.ceil(w * (times[done] - now) / LEAP)) if count == 1 else 1
             for leap in range(1, leaps + 1):
