@@ -13,7 +13,7 @@ import torchchain as tc
 from torchchain import cli
 from torchchain import network as nw
 from torchchain.ensemble.checkpoint import Checkpoint
-from torchchain.ensemble.transfer import measured_observables
+from torchchain.ensemble.measured_transfer import measured_observables
 
 TIMES = [0.0, 0.5, 3.0, 12.0]
 SCENE = tc.Scene(

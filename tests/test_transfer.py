@@ -6,7 +6,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.ensemble.transfer import Provenance
+from torchchain.ensemble.provenance import Provenance
 
 TIMES = torch.arange(0.0, 40.0, 0.5, dtype=torch.float64)
 FIELDS = ("times", "mean", "stderr", "long_time", "long_time_stderr", "block_mean", "block_long_time")

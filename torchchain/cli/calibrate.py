@@ -19,9 +19,10 @@ from torchchain.cli.flags import Calibrate
 from torchchain.cli.report import shares_left
 from torchchain.cli.runs import Run, config_of, merged_tables, running, scene_of
 from torchchain.ensemble import plan as planning
+from torchchain.ensemble.measured_transfer import band_transfer, measured_observables
 from torchchain.ensemble.scene import describe
 from torchchain.ensemble.statistics import statistical_distance, total_variation
-from torchchain.ensemble.transfer import BandTransfer, band_transfer, measured_observables
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import Calibration, MasterEquation, calibrate
 from torchchain.master.calibration import recipe
 from torchchain.master.ladder import methods

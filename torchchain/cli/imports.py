@@ -22,8 +22,9 @@ from torchchain.cli import choices, outputs, report
 from torchchain.cli.calibrate import run_calibrate
 from torchchain.cli.flags import Calibrate, Convert, FileFlags, Import
 from torchchain.energy.bands import check_bands
+from torchchain.ensemble.provenance import Provenance
 from torchchain.ensemble.stages import Stages
-from torchchain.ensemble.transfer import BandTransfer, Provenance
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.frames import ContactUnits, Frames, FramesWarning, check_opening, convert, read_frames
 from torchchain.frames.order import line_axis
 from torchchain.frames.units import LAWS

@@ -19,9 +19,9 @@ from torchchain.cli.flags import Calibrate, RunFlags, SceneFlags
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble import ranks
 from torchchain.ensemble.checkpoint import Checkpoint, Interrupted
+from torchchain.ensemble.measured_transfer import THEORY
 from torchchain.ensemble.scene import Scene, read_toml
 from torchchain.ensemble.stages import Stages
-from torchchain.ensemble.transfer import THEORY
 from torchchain.evolvers import METHODS
 
 Measured = TypeVar("Measured")

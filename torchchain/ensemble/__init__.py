@@ -3,12 +3,14 @@
 from torchchain.ensemble.checkpoint import Checkpoint, CheckpointWarning
 from torchchain.ensemble.estimate import estimate_disorder
 from torchchain.ensemble.fused import energy_moments
+from torchchain.ensemble.measured_transfer import band_transfer
 from torchchain.ensemble.observables import OBSERVABLES, Observable, register_observable
 from torchchain.ensemble.plan import Plan
+from torchchain.ensemble.provenance import Provenance
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.simulation import simulate
 from torchchain.ensemble.statistics import statistical_distance, total_variation
-from torchchain.ensemble.transfer import BandTransfer, Provenance, band_transfer
+from torchchain.ensemble.transfer import BandTransfer
 
 __all__ = [
     "OBSERVABLES", "BandTransfer", "Checkpoint", "CheckpointWarning", "Observable", "Plan", "Provenance", "Scene",

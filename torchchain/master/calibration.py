@@ -9,8 +9,9 @@ from typing import Any
 import torch
 
 from torchchain import checks
+from torchchain.ensemble.measured_transfer import with_late_average
 from torchchain.ensemble.scene import Scene
-from torchchain.ensemble.transfer import BandTransfer, with_late_average
+from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.certified import certified
 from torchchain.master.compact import CompactModel
 from torchchain.master.derived import TheoryModel
