@@ -186,10 +186,9 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         part = data.isel(way=data.observable.values == observable)
         for ax, cost in zip(axes[row], ("evolutions", "seconds"), strict=True):
             _panel(ax, part, cost, observable)
-    axes[1, 0].set_xlabel("chains evolved")
-    axes[1, 1].set_xlabel("processor seconds")
-    axes[0, 0].set_ylabel("total variation from the ensemble")
-    axes[1, 0].set_ylabel("relative error of the squared width")
+    for row, label in zip(axes, ("total variation from the ensemble", "relative error of $r^2$"), strict=True):
+        row[0].set(xlabel="chains evolved", ylabel=label)
+        row[1].set(xlabel="processor seconds", ylabel=label)
     return figure
 
 
@@ -199,10 +198,10 @@ def _panel(ax: Axes, part: xarray.Dataset, cost: str, title: str) -> None:
     for i, name in enumerate(part.name.values):
         spent = part["count"].values * float(part[cost][i])
         ax.plot(spent, part.error[i], marker="osv^D"[i % 5], color=f"C{i}", markersize=4,
-                label=f"{name}: same error at {(prices[i] / plain) ** 2:.2g} times the cost")  # fmt: skip
+                label=f"{name}: {(prices[i] / plain) ** 2:.2g}")  # fmt: skip
     ax.set(xscale="log", yscale="log", title=title)
     ax.title.set_fontsize("medium")
-    ax.legend(fontsize="small", loc="lower left")
+    ax.legend(title="cost of the same error, plain = 1")
 
 
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:

@@ -297,19 +297,17 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         part = data.isel(run=data.wave.values == name)
         _panel(axes[row, column], part, "seconds", f"{name}", float(data.reference_error[i]))
         _panel(axes[rows + row, column], part, "updates", f"{name}", float(data.reference_error[i]))
-    for ax in axes.flat[:rows]:
-        ax.set_ylabel("relative error (energy norm)")
     for ax in axes[:rows, :].flat:
         ax.set_xlabel("processor seconds, median")
     for ax in axes[rows:, :].flat:
-        ax.set_xlabel("stencil updates (evaluations x particles)")
+        ax.set_xlabel("stencil updates (evaluations $\\times$ particles)")
     for ax in axes[:, 0]:
         ax.set_ylabel("relative error (energy norm)")
     shown = [name for name in tc.METHODS if name in set(data.method.values)]
     handles = [axes[0, 0].plot([], [], label=name, markersize=4, **_look(name))[0] for name in shown]
     handles.append(axes[0, 0].plot([], [], "0.3", linestyle=":", label="float32")[0])
     handles.append(axes[0, 0].plot([], [], "k", linestyle="--", linewidth=0.8, label="reference's own error")[0])
-    figure.legend(handles=handles, loc="outside right upper", fontsize="small")
+    figure.legend(handles=handles, loc="outside lower center", ncols=5)
     return figure
 
 

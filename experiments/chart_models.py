@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import torchchain as tc
+from torchchain import plots
 
 SEARCHES = ("nonlinear", "adam")
 SEARCHED = ("paper", "basis_matrix", "swing_in")
@@ -104,8 +105,13 @@ def _prediction(config: Config, own: tc.BandTransfer, model: str) -> dict[str, A
     return {"model": model, "seconds": statistics.median(samples[1:]), "states": states}
 
 
-def _colors(data: xarray.Dataset) -> dict[str, str]:
-    return {model: f"C{i}" for i, model in enumerate(dict.fromkeys(data.model.values))}
+def _looks(data: xarray.Dataset) -> dict[str, dict[str, Any]]:
+    """Color and dashes of every model."""
+    colors, dashes = (*plots.COLORS, "0.6"), (*plots.DASHES, "-")
+    return {
+        model: {"color": colors[i % 8], "linestyle": dashes[i % 8]}
+        for i, model in enumerate(dict.fromkeys(data.model.values))
+    }
 
 
 def _markers(data: xarray.Dataset) -> dict[str, str]:
@@ -113,15 +119,20 @@ def _markers(data: xarray.Dataset) -> dict[str, str]:
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(1, 3, width=5.0, height=4.6)
+    figure, axes = harness.panels(1, 3, width=4.6, height=5.4)
     _errors(axes[0, 0], data)
     _costs(axes[0, 1], data)
     _predictions(axes[0, 2], data)
-    colors, markers = _colors(data), _markers(data)
-    handles = [axes[0, 0].plot([], [], color=c, linewidth=4, label=m)[0] for m, c in colors.items()]
-    handles += [axes[0, 0].plot([], [], m, color="0.4", label=name)[0] for name, m in markers.items()]
-    handles += [axes[0, 0].plot([], [], "k:", label="two ensembles of chains")[0]]
-    figure.legend(handles=handles, loc="outside right upper", fontsize="small")
+    handles = [axes[0, 0].plot([], [], label=model, **look)[0] for model, look in _looks(data).items()]
+    handles += [
+        axes[0, 0].plot([], [], m, ls="", color="0.3", mfc="none", label=f"fit: {name}")[0]
+        for name, m in _markers(data).items()
+    ]
+    handles += [
+        axes[0, 0].plot([], [], "k:", lw=2, label="two ensembles of chains")[0],
+        axes[0, 0].plot([], [], color="0.6", ls="--", lw=2, label="seconds of the ensemble")[0],
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5)
     figure.suptitle(
         f"$\\xi$ = {config.strength:g}, {config.realizations} chains of {config.n_particles}, 0 < $t$ ≤ {config.stop:g}"
     )
@@ -129,56 +140,53 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
 
 
 def _errors(ax: Axes, data: xarray.Dataset) -> None:
-    colors, markers = _colors(data), _markers(data)
+    looks, markers = _looks(data), _markers(data)
     for method in markers:
-        for model in colors:
+        for model in looks:
             curve = data.isel(fit=(data.method.values == method) & (data.model.values == model))
             if curve.sizes["fit"]:
                 ax.plot(
-                    curve.bands, curve.fresh, color=colors[model], marker=markers[method], markersize=5, linewidth=0.9
+                    curve.bands, curve.fresh, marker=markers[method], markersize=4, linewidth=0.9, mfc="none", **looks[model]
                 )
-    ax.plot(data.n_bands, data.noise, "k:")
-    ax.set(xscale="log", yscale="log", xlabel="bands B", ylabel="total variation from fresh chains", title="(a) error")
+    ax.plot(data.n_bands, data.noise, "k:", lw=2)
+    ax.set(xscale="log", yscale="log", xlabel="bands $B$", ylabel="total variation from fresh chains", title="(a) error")
     ax.set_xticks(data.n_bands.values, [f"{b}" for b in data.n_bands.values], minor=False)
     ax.minorticks_off()
 
 
 def _costs(ax: Axes, data: xarray.Dataset) -> None:
-    colors, markers = _colors(data), _markers(data)
+    looks, markers = _looks(data), _markers(data)
     shown = 32 if 32 in data.n_bands.values else int(data.n_bands[-1])
     part = data.isel(fit=data.bands.values == shown)
     for i in range(part.sizes["fit"]):
         one = part.isel(fit=i)
         ax.errorbar(
-            one.seconds, one.fresh, yerr=one.fresh_stderr, color=colors[str(one.model.values)],
-            marker=markers[str(one.method.values)], markersize=7,
+            one.seconds, one.fresh, yerr=one.fresh_stderr, color=looks[str(one.model.values)]["color"], lw=0.8,
+            marker=markers[str(one.method.values)], markersize=5, mfc="none",
         )  # fmt: skip
     where = list(data.n_bands.values).index(shown)
-    ax.axhline(float(data.noise[where]), color="k", linestyle=":")
-    ax.axvline(float(data.ensemble_seconds[where]), color="0.6", linestyle="--")
-    ax.annotate("the ensemble", (float(data.ensemble_seconds[where]), 0.98), xycoords=("data", "axes fraction"), rotation=90,
-                va="top", ha="right", color="0.4", fontsize="small")  # fmt: skip
-    ax.set(xscale="log", yscale="log", xlabel="seconds of the calibration", ylabel="total variation from fresh chains",
-           title=f"(b) error and calibration, B = {shown}")  # fmt: skip
+    ax.axhline(float(data.noise[where]), color="k", linestyle=":", lw=2)
+    ax.axvline(float(data.ensemble_seconds[where]), color="0.6", linestyle="--", lw=2)
+    ax.set(xscale="log", yscale="log", xlabel="seconds, calibration", ylabel="total variation from fresh chains",
+           title=f"(b) calibration, {shown} bands")  # fmt: skip
     for label in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
         label("{x:g}")
 
 
 def _predictions(ax: Axes, data: xarray.Dataset) -> None:
-    for model, color in _colors(data).items():
+    for model, look in _looks(data).items():
         curve = data.isel(prediction=data.prediction_model.values == model)
-        ax.plot(curve.prediction_bands, curve.prediction_seconds, "o-", color=color, markersize=4)
-    ax.plot(data.n_bands, data.ensemble_seconds, "--", color="0.6", label="the ensemble, all sources")
+        ax.plot(curve.prediction_bands, curve.prediction_seconds, marker=".", **look)
+    ax.plot(data.n_bands, data.ensemble_seconds, "--", color="0.6", lw=2)
     ax.set(
         xscale="log",
         yscale="log",
-        xlabel="bands B",
+        xlabel="bands $B$",
         ylabel=f"seconds, one start at {PREDICTED_TIMES} times",
         title="(c) prediction",
     )
     ax.set_xticks(data.n_bands.values, [f"{b}" for b in data.n_bands.values], minor=False)
     ax.minorticks_off()
-    ax.legend(fontsize="small", loc="center left")
 
 
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:

@@ -184,8 +184,8 @@ def _look(label: str) -> dict[str, Any]:
     i = labels.index(label)
     adaptive = label in INTEGRATORS and INTEGRATORS[label].adaptive and "scipy" not in label
     line = "-" if adaptive else "--" if label in solving.STABILITY else ":"
-    size = {"markersize": 11, "zorder": 5} if "step" not in label and label not in INTEGRATORS else {"markersize": 4}  # fmt: skip
-    return {"color": f"C{i % 10}", "marker": "*osv^D<>pPXdh8"[i % 14], "linestyle": line, "linewidth": 1, **size}
+    size = {"markersize": 9, "zorder": 5} if label == "expm" else {"markersize": 4}
+    return {"color": f"C{i % 7}", "marker": "*osv^D<>pPXdh8"[i % 14], "linestyle": line, "linewidth": 1, **size}
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
@@ -193,18 +193,19 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     for row, case in enumerate((MILD, STIFF)):
         part = data.isel(run=data.rates.values == case)
         until = config.until if case == MILD else config.stiff_until
-        title = f"{case}, t = {until:g}" + (f": upper bands {config.faster:g} times as fast" if case == STIFF else "")
+        title = f"{case}, $t$ = {until:g}" + (f", upper bands {config.faster:g} times" if case == STIFF else "")
         for ax, cost in zip(axes[row], ("seconds", "evaluations"), strict=True):
             _panel(ax, part, cost, title, float(data.reference_error[row]))
     for ax in axes.flat:
         ax.xaxis.set_minor_formatter("")
     axes[1, 0].set_xlabel("processor seconds, median")
-    axes[1, 1].set_xlabel("evaluations of e Q (all sources together)")
+    axes[1, 1].set_xlabel(r"evaluations of $e\,Q$ (all sources together)")
     for ax in axes[:, 0]:
         ax.set_ylabel("largest error of any energy")
     labels = list(dict.fromkeys(data.solver.values))
     handles = [axes[0, 0].plot([], [], label=label, **_look(label))[0] for label in labels]
-    figure.legend(handles=handles, loc="outside right upper", fontsize="small")
+    handles.append(axes[0, 0].plot([], [], "k--", lw=0.8, label="the reference's own error")[0])
+    figure.legend(handles=handles, loc="outside lower center", ncols=6)
     return figure
 
 

@@ -179,8 +179,8 @@ def markdown(data: xarray.Dataset, config: Config) -> str:
 def draw(data: xarray.Dataset, config: Config) -> Figure:
     figure, axes = harness.panels(2, 2, width=5.8, height=4.6)
     accuracy = config.accuracies[len(config.accuracies) // 2]
-    _dots(axes[0, 0], data, "evolver", accuracy, f"(a) evolving one chain to error {accuracy:.0e}")
-    _dots(axes[0, 1], data, "solver", accuracy, f"(b) solving the master equation to error {accuracy:.0e}")
+    _dots(axes[0, 0], data, "evolver", accuracy, f"(a) one chain to error {accuracy:.0e}")
+    _dots(axes[0, 1], data, "solver", accuracy, f"(b) master equation to error {accuracy:.0e}")
     _model_panel(axes[1, 0], data)
     _way_panel(axes[1, 1], data)
     return figure
@@ -195,48 +195,48 @@ def _dots(ax: Axes, data: xarray.Dataset, axis: str, accuracy: float, title: str
         if one.sizes[axis]:
             places = [scenes.index(scene) for scene in one[f"{axis}_scene"].values]
             own = method in chart_evolvers.COLORS or method == "expm"
-            color = chart_evolvers.COLORS.get(method, "C2" if own else f"{0.25 + 0.045 * (i % 12):.2f}")
+            color = chart_evolvers.COLORS.get(method, "C5" if own else f"{0.25 + 0.045 * (i % 12):.2f}")
             ax.plot(
                 one[f"{axis}_seconds"],
                 places,
                 "os^vD<>pP*Xd"[i % 12],
                 color=color,
-                markersize=8 if own else 5,
+                markersize=6 if own else 4,
                 label=method,
             )
     ax.set_yticks(range(len(scenes)), scenes, fontsize="small")
     ax.set(xscale="log", xlabel="processor seconds, fastest setting", title=title, ylim=(-0.6, len(scenes) - 0.4))
     ax.grid(axis="y", alpha=0.3)
-    ax.legend(fontsize=7, ncols=5, loc="upper center", bbox_to_anchor=(0.4, -0.14))
+    ax.legend()
 
 
 def _model_panel(ax: Axes, data: xarray.Dataset) -> None:
     for i, name in enumerate(dict.fromkeys(data.model_name.values)):
         part = data.isel(model=data.model_name.values == name)
         ax.plot(
-            part.model_bands, part.model_distance / part.model_noise, marker="os^vD*P"[i % 7], color=f"C{i}", label=name
+            part.model_bands, part.model_distance / part.model_noise, marker="os^vD*PX"[i % 8], color=f"C{i % 7}", label=name
         )
     ax.axhline(1, color="k", linestyle=":", label="two ensembles of chains")
     bands = list(dict.fromkeys(data.model_bands.values))
-    ax.set(xscale="log", yscale="log", xlabel="bands B", ylabel="distance from fresh chains\n/ of two ensembles",
+    ax.set(xscale="log", yscale="log", xlabel="bands $B$", ylabel="distance from fresh chains\n/ of two ensembles",
            title="(c) models, each by its nearest fit")  # fmt: skip
     ax.set_xticks(bands, [str(b) for b in bands])
     ax.yaxis.set_major_formatter("{x:g}")
     ax.minorticks_off()
-    ax.legend(fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
+    ax.legend()
 
 
 def _way_panel(ax: Axes, data: xarray.Dataset) -> None:
     order = np.arange(data.sizes["way"])[::-1]
     ax.barh(order + 0.2, data.way_work, 0.35, color="C0", label="chains evolved")
-    ax.barh(order - 0.2, data.way_seconds, 0.35, color="C1", label="seconds")
+    ax.barh(order - 0.2, data.way_seconds, 0.35, color="C1", hatch="///", label="seconds")
     names = [
         f"{o.partition(':')[0]}:\n{n}" for o, n in zip(data.way_observable.values, data.way_name.values, strict=True)
     ]
     ax.set_yticks(order, names, fontsize="small")
     ax.axvline(1, color="k", linewidth=0.8)
-    ax.set(xlabel="cost of the same error, plain realizations = 1", title="(d) averaging over the ensemble")
-    ax.legend(fontsize="small", loc="upper right")
+    ax.set(xlabel="cost of the same error, plain = 1", title="(d) averaging over the ensemble")
+    ax.legend()
 
 
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:

@@ -540,7 +540,7 @@ def _edges(ax: Axes, data: xarray.Dataset) -> None:
         factor, ratio = float(one.factor), float(one.found / one.predicted)
         ax.fill_betweenx([y - 0.3, y + 0.3], 1 / factor, factor, color="0.88", linewidth=0)
         ax.plot(ratio, y, "o", color=COLORS[kind(str(one.answer.values), bool(one.by_design))])
-        labels.append(f"{one.method.values}: {one.quantity.values}".replace("^2", "²"))
+        labels.append(_symbols(f"{one.method.values}: {one.quantity.values}"))
     ax.axvline(1, color="k", linewidth=0.8)
     for name, color in COLORS.items():
         if name != "silent" or "silent" in {
@@ -563,6 +563,13 @@ def _edges(ax: Axes, data: xarray.Dataset) -> None:
     ax.legend(fontsize=8, loc="upper right", title="beyond its edge the library", title_fontsize=8)
 
 
+def _symbols(words: str) -> str:
+    """True symbols in place of the words of the table."""
+    for word, symbol in (("w_max^2", "$\\omega_{max}^2$"), ("w_max", "$\\omega_{max}$"), ("|lambda|", "$|\\lambda|$"), ("w step", "$\\omega$ step")):
+        words = words.replace(word, symbol)
+    return words
+
+
 def _curves(ax: Axes, data: xarray.Dataset) -> None:
     shown = [
         ("verlet", "w_max step"), ("symplectic4", "w_max step"), ("chebyshev", "w_max^2 / bound"), ("rk4", "w_max step"),
@@ -576,9 +583,10 @@ def _curves(ax: Axes, data: xarray.Dataset) -> None:
         ax.plot(
             one.relative,
             values,
-            marker=".",
-            color=f"C{i}",
-            label=f"{method}, {quantity}" if "step" in quantity else method,
+            marker="os^vD<>pX"[i],
+            mfc="none",
+            color=(*plots.COLORS, "0.6", "0.4")[i],
+            label=_symbols(f"{method}, {quantity}") if "step" in quantity else method,
         )
     ax.axhline(1, color="k", linewidth=0.8)
     ax.axvline(1, color="k", linewidth=0.8, linestyle=":")

@@ -242,6 +242,7 @@ def drawn(script: Script, data: xarray.Dataset, config: Any) -> Figure:
     """The figure in the sizes of print, legends off the data."""
     with plots.style():
         figure = script.draw(data, config)
+        plots.wrapped_labels(figure)
         plots.legends_below(figure)
         shown = [ax for ax in figure.axes if ax.get_subplotspec() is not None and ax.axison]  # no bars, no insets
         if len(shown) > 1 and not any("(a)" in ax.get_title(where) for ax in shown for where in ("left", "center")):

@@ -164,7 +164,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     axes = figure.subplots(2, max(n, 3), squeeze=False)
     for i, t in enumerate(data.instant.values):
         drawn = disks(axes[0, i], data, data.snap.values[i])
-        axes[0, i].set_title(f"energy of the disks at t = {t:g}")
+        axes[0, i].set_title(f"disks, t = {t:g}")
     figure.colorbar(drawn, ax=axes[0, n - 1], label="energy$^{1/4}$")
     axis = axes[1, 0]
     image = axis.pcolormesh(

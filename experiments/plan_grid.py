@@ -286,13 +286,13 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     ax.axvline(config.within, color="C3", linestyle="--", label=f"{config.within:g} times")
     ax.axhline(0.9, color="0.6", linestyle=":", label="nine scenes in ten")
     ax.set(
-        xlabel="seconds of the choice / seconds of the fastest", ylabel="share of scenes", ylim=(0, 1.02),
-        title="How good the choice is",
+        xlabel="seconds, choice / fastest", ylabel="share of scenes", ylim=(0, 1.02),
+        title="how good the choice is",
     )  # fmt: skip
     ax.legend(loc="lower right", fontsize="small")
     for ax, measured, predicted, unit in (
         (axes[0, 1], "seconds", "predicted_seconds", "seconds"),
-        (axes[0, 2], "error", "predicted_error", "error / scale of the observable"),
+        (axes[0, 2], "error", "predicted_error", "error / scale"),
     ):
         low, high = np.inf, 0.0
         for j, way in enumerate(WAYS):
@@ -305,8 +305,8 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
             low, high = min(low, x[here].min(), y[here].min()), max(high, x[here].max(), y[here].max())
         ax.plot([low, high], [low, high], "k-", linewidth=0.8)
         ax.set(xscale="log", yscale="log", xlabel=f"predicted {unit}", ylabel=f"measured {unit}")
-    axes[0, 1].set(title="Seconds, every way that was run")
-    axes[0, 2].set(title="Error: predictions are meant as bounds")
+    axes[0, 1].set(title="every way that was run")
+    axes[0, 2].set(title="predictions are bounds")
     axes[0, 1].legend(fontsize="x-small")
     return figure
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -62,6 +63,26 @@ def legends_below(figure: Any, columns: int = 2) -> None:
         row = 0 if where is None else where.rowspan.start
         rows[row] = max(rows.get(row, 0), -(-len(labels) // across) + bool(title))
     figure.set_figheight(figure.get_figheight() + 0.14 * sum(rows.values()))
+
+
+def wrapped_labels(figure: Any) -> None:
+    """Titles and labels of vertical axes that are longer than their panel, on several lines; formulas are not broken."""
+    for ax in figure.axes:
+        where = ax.get_subplotspec()
+        if where is None:
+            continue
+        shape = where.get_gridspec()
+        for label, room in (
+            (ax.yaxis.label, 0.75 * figure.get_figheight() / shape.nrows),
+            (ax.title if ax.get_title() else ax._left_title, 0.95 * figure.get_figwidth() / shape.ncols),
+        ):
+            text, most = label.get_text(), int(room / CHARACTER)
+            if len(text) > most and not set("$\n") & set(text):
+                label.set_text(textwrap.fill(text, most))
+
+
+CHARACTER = 0.062
+"""Width of a character of eight points, in inches, on average."""
 
 
 def legend(ax: Axes, columns: int = 2, **where: Any) -> None:
