@@ -10,9 +10,12 @@ import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.energy.bands import center_tones
 from torchchain.theory import born_rates, effective_medium, theory_transfer
+from torchchain.theory.crossed import crossed_transfer
+from torchchain.theory.ladder import spectrum_edges
 from torchchain.theory.law import law_of
 from torchchain.theory.localized import density_correlation
 from torchchain.theory.medium import coherent_mass, site_resolvent, wavenumber
+from torchchain.theory.transfer import described
 
 TIMES = torch.tensor([0.0, 1.0, 2.0, 4.0, 8.0, 32.0, 100.0], dtype=torch.float64)
 KINDS = ("normal", "uniform", "binary", "lognormal", "gamma")
@@ -148,10 +151,35 @@ def test_transfer_is_that_of_chains(chains):
     result = theory_transfer(tc.Disorder(strength=0.2), 64, 8, TIMES)
     noise = 0.4 * chains.stderr.sum(-1).mean(0)  # mean distance of an ensemble from an endless one
     error = distance(result.mean, chains.mean)
-    early = TIMES <= 4
-    assert bool((error[early] <= 1.5 * noise[early] + 3e-4).all())
+    early = TIMES <= 8
+    assert bool((error[early] <= 1.5 * noise[early] + 1e-7).all())
     assert bool((error <= 0.015 + noise).all())
     assert float(distance(result.long_time, chains.long_time)) <= 0.008
+
+
+def crossed(xi, kind="normal"):
+    law, waves = described(tc.Disorder(kind=kind, strength=xi), 64, 8, [22, 30], "periodic", None, "linear", 0.0)
+    return crossed_transfer(law, waves, torch.tensor([0.0, 6.0, 12.0], dtype=torch.float64), spectrum_edges(law)[0])
+
+
+@pytest.mark.parametrize("kind", ["normal", "gamma"])
+def test_crossed_scattering_keeps_the_energy(kind):
+    change = crossed(0.3, kind)
+    assert float(change.abs().max()) > 0.005
+    assert float(change.sum(-1).abs().max()) < 2e-4 * float(change.abs().max())
+    assert bool((change[:, 0] == 0).all())
+
+
+def test_crossed_scattering_is_of_fourth_order():
+    weak, strong = crossed(0.03), crossed(0.06)
+    torch.testing.assert_close(strong, 16 * weak, rtol=0, atol=0.1 * float(strong.abs().max()))
+
+
+def test_crossed_scattering_is_what_the_ladder_lacks_at_early_times(chains):
+    disorder = tc.Disorder(strength=0.2)
+    whole, ladder = (theory_transfer(disorder, 64, 8, [8.0], localization=x).mean for x in (True, False))
+    measured = chains.mean[:, TIMES == 8]
+    assert float(distance(whole, measured)) < 0.6 * float(distance(ladder, measured))
 
 
 def test_localization_is_what_the_ladder_lacks_at_late_times(chains):

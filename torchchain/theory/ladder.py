@@ -85,6 +85,23 @@ class Waves:
         weight[-1] = 1.0
         return weight
 
+    @property
+    def around(self) -> Tensor:
+        """All wavenumbers of the ring, (N,)."""
+        return 2 * math.pi / self.n_particles * torch.arange(self.n_particles, dtype=torch.float64)
+
+    @property
+    def wavenumbers(self) -> Tensor:
+        """Of the sources, (source,)."""
+        return 2 * torch.asin(self.sources.sqrt() / 2)
+
+    def banded(self, values: Tensor) -> Tensor:
+        """(1/N) sum over a band of w_q^2 times values at the wavenumbers ``around``, even in q: (..., q) to (..., band)."""
+        weighted = values[..., 1 : self.n_particles // 2 + 1] * (
+            self.tone_squares * self.tone_weights / self.n_particles
+        )
+        return weighted.reshape(*values.shape[:-1], self.n_bands, -1).sum(-1)
+
     def received(self, argument: Tensor) -> Tensor:
         """(1/N) sum over a band of w_q^2 / (w_q^2 - e), [band, frequency]; tones one block at a time."""
         n, bands = self.n_particles, self.n_bands
@@ -155,29 +172,25 @@ def ladder_transfer(law: Law, waves: Waves, times: Tensor, edges: tuple[float, f
 
 
 def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Tensor:
-    # Frequencies (i + 1/2) step + i eta; those with a negative real part are mirror images.
     points = stretch.points
-    right = (torch.arange(points, dtype=torch.float64) + 0.5) * stretch.step
-    z = torch.complex(right, torch.full_like(right, stretch.eta))
-    loss = 1 - 1j * waves.damping * z  # contact damping: K -> (1 - i damping z) K
-    inner = z / loss.sqrt()
+    z, loss, inner = line(waves, stretch)
     mass, _ = coherent_mass(inner, law, waves.ring)
     argument = inner.square() * mass
     g = site_resolvent(argument, waves.ring)
     received = waves.received(argument)
     source = 1 / (waves.sources[:, None] - argument)
-    window = _window(z, stretch)
-    z, inner = _mirrored(z, -1), _mirrored(inner, -1)
-    mass, g, argument, window, loss = (_mirrored(x) for x in (mass, g, argument, window, loss))
-    received, source = _mirrored(received), _mirrored(source)
-    coherent = _coherent(law, waves, times, stretch, z, source / loss, loss, window)
+    window = window_of(z, stretch)
+    z, inner = mirrored(z, -1), mirrored(inner, -1)
+    mass, g, argument, window, loss = (mirrored(x) for x in (mass, g, argument, window, loss))
+    received, source = mirrored(received), mirrored(source)
+    coherent = coherent_energy(law, waves, times, stretch, z, source / loss, loss, window)
 
     # A pair has the mean frequency (n + 1/2) step and the difference 2 m step + 2 i eta; n < 0 mirrors n >= 0.
     differences = 2 * stretch.step * torch.arange(points, dtype=torch.float64)
     low_pass = torch.ones(points, dtype=torch.complex128)
     if stretch.start >= _LATE:  # a Gaussian average of the energy itself: the whole complex difference
         low_pass = torch.exp(
-            -(torch.complex(differences, torch.full_like(right, 2 * stretch.eta)) * _AVERAGE).square() / 2
+            -(torch.complex(differences, torch.full_like(differences, 2 * stretch.eta)) * _AVERAGE).square() / 2
         )
     used = max(1, int((low_pass.abs() > 1e-9).sum()))
     low_pass[1:] *= 2
@@ -211,7 +224,7 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
             energy_in_time += angle.cos().T @ flat.real + angle.sin().T @ flat.imag
     energy_in_time *= growth[:, None]
     area = 2 * stretch.step**2 / (2 * math.pi) ** 2
-    scale = _source_scale(law, waves) * area
+    scale = source_scale(law, waves) * area
     spread = (
         energy_in_time.reshape(len(times), len(waves.sources), waves.n_bands).transpose(0, 1) * scale[:, None, None]
     )
@@ -220,17 +233,26 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
     return spread
 
 
-def _source_scale(law: Law, waves: Waves) -> Tensor:
+def line(waves: Waves, stretch: Stretch) -> tuple[Tensor, Tensor, Tensor]:
+    """Frequencies (i + 1/2) step + i eta, (frequency,), those with a negative real part being mirror images; 1 - i damping
+    z, by which contact damping multiplies K; and the frequency that the chain without damping sees."""
+    right = (torch.arange(stretch.points, dtype=torch.float64) + 0.5) * stretch.step
+    z = torch.complex(right, torch.full_like(right, stretch.eta))
+    loss = 1 - 1j * waves.damping * z
+    return z, loss, z / loss.sqrt()
+
+
+def source_scale(law: Law, waves: Waves) -> Tensor:
     """The factor of a source before G_k G~_k: w_k^2 for displacements, 1 / < 1/m > for momenta."""
     return torch.full_like(waves.sources, 1 / law.moment(-1)) if waves.momentum else waves.sources
 
 
-def _mirrored(values: Tensor, sign: int = 1) -> Tensor:
+def mirrored(values: Tensor, sign: int = 1) -> Tensor:
     """Values at -z* before those at z: their conjugates (for z itself minus them)."""
     return torch.cat([sign * values.flip(-1).conj(), values], dim=-1)
 
 
-def _window(z: Tensor, stretch: Stretch) -> Tensor:
+def window_of(z: Tensor, stretch: Stretch) -> Tensor:
     """1 on the spectrum, smoothly 0 beyond: in time a kernel narrower than the stretch's distance from 0."""
     at = z.numpy()
     return torch.from_numpy(
@@ -238,7 +260,7 @@ def _window(z: Tensor, stretch: Stretch) -> Tensor:
     )
 
 
-def _coherent(
+def coherent_energy(
     law: Law, waves: Waves, times: Tensor, stretch: Stretch, z: Tensor, mean: Tensor, loss: Tensor, window: Tensor
 ) -> Tensor:
     """Energy that is still in the source's own wave, [source, time], from the mean amplitudes.

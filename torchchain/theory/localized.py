@@ -30,6 +30,7 @@ from torchchain.theory.ladder import Waves
 from torchchain.theory.law import Law
 from torchchain.theory.medium import coherent_mass, site_resolvent, wavenumber
 
+_LEAVING = 3  # power with which the first crossed scattering gives way
 _ABOVE = 1e-8  # the real axis is taken from above, at this distance times the frequency
 
 
@@ -67,10 +68,12 @@ class Return:
     """Numbers of the enhanced return, measured over rings of N = 256, normal masses, xi = 0.1, 0.3 and 0.5.
 
     With a = 2 Im q: C has the argument dk / (a (1 + narrowing a)), and its share exp(-(onset (1 + delay a) / x)^power)
-    has come at time t, x = 2 t / t_level, t_level = 2 pi (density of states) / a.
+    has come at time t, x = 2 t / t_level, t_level = 2 pi (density of states) / a. Before it stands the crossed scattering of
+    two particles (:mod:`torchchain.theory.crossed`), in the part 1 - exp(-(first (1 + delay a) / x)^3) of every frequency,
+    and less where it changes shares by ``most`` or more, at which it is no small correction.
 
     Attributes:
-        narrowing, onset, delay, power: pure numbers.
+        narrowing, onset, delay, power, first, most: pure numbers.
 
     Example:
         >>> tc.theory.Return(onset=2.0).onset  # in place of the measured one
@@ -78,9 +81,11 @@ class Return:
     """
 
     narrowing: float = 1.2
-    onset: float = 2.19
-    delay: float = 0.95
-    power: float = 1.53
+    onset: float = 1.94
+    delay: float = 1.03
+    power: float = 1.35
+    first: float = 2.28
+    most: float = 0.03
 
 
 MEASURED = Return()
@@ -110,33 +115,37 @@ def source_frequencies(law: Law, waves: Waves, edge: float, points: int = 4) -> 
     medium = _Line(law, edge)
     x, weight = np.polynomial.legendre.leggauss(points)
     squares, weights = waves.tone_squares[:, None], waves.tone_weights[:, None]
+    panels = [
+        _panels(center, half_width, edge) for center, half_width in zip(*medium.lines(waves.sources), strict=True)
+    ]
+    nodes = [((edges[1:] + edges[:-1]) / 2, (edges[1:] - edges[:-1]) / 2) for edges in panels]
+    frequencies = [torch.from_numpy((middle[:, None] + half[:, None] * x).ravel()) for middle, half in nodes]
+    counts = [len(w) for w in frequencies]
+    argument, g = medium(torch.cat(frequencies))
     found = []
-    for source in waves.sources.tolist():
-        center, half_width = medium.line(source)
-        steps = half_width * 0.25 * 2.0 ** np.arange(60)
-        coarse = 0.04 * edge
-        steps = steps[steps < coarse]
-        steps = np.concatenate([[0.0], steps, np.arange(steps[-1] + coarse if len(steps) else coarse, edge, coarse)])
-        lower = edge * 1e-4
-        edges = np.unique(np.concatenate([center - steps, center + steps, [lower, edge]]))
-        edges = edges[(edges >= lower) & (edges <= edge)]
-        middle, half = (edges[1:] + edges[:-1]) / 2, (edges[1:] - edges[:-1]) / 2
-        w = torch.from_numpy((middle[:, None] + half[:, None] * x).ravel())
+    for source, w, (_, half), e, density in zip(
+        waves.sources.tolist(), frequencies, nodes, argument.split(counts), (argument * g).imag.split(counts), strict=True
+    ):  # fmt: skip
         panel = torch.from_numpy((half[:, None] * weight).ravel())
-        argument, g = medium(w)
-        line = (1 / (source - argument)).imag.clamp(min=0) * (w if waves.momentum else 1 / w) * panel
-        spectral = weights * squares * (1 / (squares - argument)).imag.clamp(min=1e-300)
-        receivers = spectral / spectral.sum(0)
-        width = 2 * wavenumber(argument).imag
-        density = (2 / (math.pi * w)) * (argument * g).imag
+        line = (1 / (source - e)).imag.clamp(min=0) * (w if waves.momentum else 1 / w) * panel
         used = line > 1e-12 * line.sum()
-        line = line[used]
-        found.append(
-            Frequencies(
-                w[used], line / line.sum(), width[used], 2 * math.pi * density[used] / width[used], receivers[:, used]
-            )
-        )
+        w, e, line = w[used], e[used], line[used]
+        spectral = weights * squares * (1 / (squares - e)).imag.clamp(min=1e-300)
+        width = 2 * wavenumber(e).imag
+        level_time = 2 * math.pi * (2 / (math.pi * w)) * density[used] / width
+        found.append(Frequencies(w, line / line.sum(), width, level_time, spectral / spectral.sum(0)))
     return found
+
+
+def _panels(center: float, half_width: float, edge: float) -> np.ndarray:
+    """Ends of panels from nearly 0 to the edge of the spectrum that shrink towards a line."""
+    steps = half_width * 0.25 * 2.0 ** np.arange(60)
+    coarse = 0.04 * edge
+    steps = steps[steps < coarse]
+    steps = np.concatenate([[0.0], steps, np.arange(steps[-1] + coarse if len(steps) else coarse, edge, coarse)])
+    lower = edge * 1e-4
+    edges = np.unique(np.concatenate([center - steps, center + steps, [lower, edge]]))
+    return edges[(edges >= lower) & (edges <= edge)]
 
 
 class _Line:
@@ -161,14 +170,17 @@ class _Line:
         argument = z.square() * mass
         return argument, site_resolvent(argument)
 
-    def line(self, squared: float) -> tuple[float, float]:
-        """Center and half width of the line of a wave with this w_k^2."""
-        low, high = 0.0, float(self._mass.x[-1])
+    def lines(self, squares: Tensor) -> tuple[list[float], list[float]]:
+        """Centers and half widths of the lines of waves with these w_k^2."""
+        squared = squares.numpy()
+        low, high = np.zeros_like(squared), np.full_like(squared, self._mass.x[-1])
         for _ in range(60):
             center = (low + high) / 2
-            low, high = (center, high) if center**2 * self._mass(center).real < squared else (low, center)
-        argument, _ = self(torch.tensor([center], dtype=torch.float64))
-        return center, max(abs(float(argument.imag[0])) / (2 * center), 1e-10)
+            below = center**2 * self._mass(center).real < squared
+            low, high = np.where(below, center, low), np.where(below, high, center)
+        argument, _ = self(torch.from_numpy(center))
+        half_width = (argument.imag.abs() / (2 * torch.from_numpy(center))).clamp(min=1e-10)
+        return center.tolist(), half_width.tolist()
 
 
 def interference(waves: Waves, wavenumber: float, spectrum: Frequencies, numbers: Return = MEASURED) -> Tensor:
@@ -191,9 +203,18 @@ def interference(waves: Waves, wavenumber: float, spectrum: Frequencies, numbers
 
 def onset(times: Tensor, spectrum: Frequencies, numbers: Return = MEASURED) -> Tensor:
     """Share of the interference that has come by each time, (node, time); 0 at t = 0, 1 for ever."""
+    return torch.exp(-((numbers.onset * _lateness(times, spectrum, numbers)) ** numbers.power))
+
+
+def first_part(times: Tensor, spectrum: Frequencies, numbers: Return = MEASURED) -> Tensor:
+    """Part of the source's energy whose interference is still that of two particles, (time,); 1 at t = 0, 0 for ever."""
+    return -torch.expm1(-((numbers.first * _lateness(times, spectrum, numbers)) ** _LEAVING)).T @ spectrum.energy
+
+
+def _lateness(times: Tensor, spectrum: Frequencies, numbers: Return) -> Tensor:
+    """(1 + delay a) / x, (node, time)."""
     x = 2 * times / spectrum.level_time[:, None]
-    start = numbers.onset * (1 + numbers.delay * spectrum.width[:, None])
-    return torch.exp(-((start / x.clamp(min=1e-9)) ** numbers.power))
+    return (1 + numbers.delay * spectrum.width[:, None]) / x.clamp(min=1e-9)
 
 
 def _even_convolution(a: Tensor, b: Tensor, n: int) -> Tensor:

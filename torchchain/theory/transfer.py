@@ -13,9 +13,18 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import BOUNDARIES, CONTACTS, Disorder
 from torchchain.energy.bands import center_tones, check_bands
+from torchchain.theory.crossed import LAST, crossed_transfer, fading
 from torchchain.theory.ladder import DECAY, Waves, ladder_transfer, spectrum_edges, stretches
 from torchchain.theory.law import Law, law_of
-from torchchain.theory.localized import MEASURED, Frequencies, Return, interference, onset, source_frequencies
+from torchchain.theory.localized import (
+    MEASURED,
+    Frequencies,
+    Return,
+    first_part,
+    interference,
+    onset,
+    source_frequencies,
+)
 from torchchain.threads import single_thread
 
 LATEST_TIME = 5000.0
@@ -23,6 +32,7 @@ LATEST_TIME = 5000.0
 FADING = 800.0
 """From here on what the ladder has not yet spread fades exponentially: each frequency has one rate, of leaving the tone."""
 _MOST_TONES = 1024  # of the ring on which interference is added up: beyond it bands are wide against its features
+_SLACK = 2e-4  # least share of definition "site", as in ensembles
 _SHAPE_ERROR = 0.2  # part of the interference that its universal shape misses, measured
 _ONSET_ERROR = 0.6  # part of a factor of two in its time of onset, likewise
 
@@ -130,14 +140,22 @@ def transfer_of_law(
         long_time = torch.zeros(sources, n_bands, dtype=torch.float64)
         long_error = torch.zeros(sources, dtype=torch.float64)
         error = torch.zeros(sources, len(times), dtype=torch.float64)
-        for s, (plain, pattern, change, doubt) in enumerate(_returns(law, waves, times, edges[0], numbers)):
+        early = times <= LAST
+        crossed = torch.zeros(sources, len(times), n_bands, dtype=torch.float64)
+        if localization and bool(early.any()) and law.variance > 0:
+            crossed[:, early] = crossed_transfer(law, waves, times[early], edges[0])
+            if damping == 0:  # rounding
+                crossed[torch.arange(sources), :, waves.source_bands] -= crossed.sum(-1)
+        for s, (plain, pattern, change, doubt, first) in enumerate(_returns(law, waves, times, edges[0], numbers)):
             if bool(late.any()):
                 mean[s, late] = _faded(
                     ladder[s, torch.searchsorted(asked, asked[-1] / asked.new_tensor([2.0, 1.0]))], plain, times[late]
                 )
             error[s] = doubt
             if localization:
-                mean[s] += change
+                part = first * fading(times) / (1 + (_distance(crossed[s]) / numbers.most) ** 4)
+                part = torch.minimum(part, _room(mean[s], crossed[s]))[:, None]
+                mean[s] += part * crossed[s] + (1 - part) * change
             else:
                 error[s] += _distance(change)
             if damping == 0:
@@ -155,14 +173,16 @@ def transfer_of_law(
 def predicted_error(law: Law, waves: Waves, times: Tensor) -> Tensor:
     """``systematic`` of :func:`transfer_of_law` without the ladder, [source, time], in a fraction of its time."""
     with single_thread(), torch.no_grad():
-        return torch.stack([doubt for *_, doubt in _returns(law, waves, times, spectrum_edges(law)[0], MEASURED)])
+        return torch.stack(
+            [doubt for _, _, _, doubt, _ in _returns(law, waves, times, spectrum_edges(law)[0], MEASURED)]
+        )
 
 
 def _returns(
     law: Law, waves: Waves, times: Tensor, edge: float, numbers: Return
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
     """Of every source: at infinite time without interference, (band,); what interference changes, (band, node); what of
-    it has come, (time, band); and the estimated error, (time,)."""
+    it has come, (time, band); the estimated error, (time,); and the part that is still two particles', (time,)."""
     ring = _coarser(waves)
     k = (2 * torch.asin(waves.sources.sqrt() / 2)).tolist()
     for spectrum, wave in zip(source_frequencies(law, ring, edge), k, strict=True):
@@ -171,7 +191,8 @@ def _returns(
         left = torch.exp(-waves.damping * spectrum.nodes.square()[:, None] * times)
         change = (came * left).T @ pattern.T
         sooner = ((earlier - came) * left).T @ pattern.T
-        yield plain, pattern, change, _SHAPE_ERROR * _distance(change) + _ONSET_ERROR * _distance(sooner)
+        doubt = _SHAPE_ERROR * _distance(change) + _ONSET_ERROR * _distance(sooner)
+        yield plain, pattern, change, doubt, first_part(times, spectrum, numbers)
 
 
 def _faded(ladder: Tensor, settled: Tensor, times: Tensor) -> Tensor:
@@ -180,6 +201,12 @@ def _faded(ladder: Tensor, settled: Tensor, times: Tensor) -> Tensor:
     half, last = rest.abs().sum(-1).clamp(min=1e-12).tolist()
     rate = max(0.0, math.log(half / last)) / (FADING / 2)
     return settled + rest[1] * torch.exp(-rate * (times - FADING))[:, None]
+
+
+def _room(energy: Tensor, change: Tensor) -> Tensor:
+    """Times change that energy bears, (time,), before a band has less than nothing (or than it had), _SLACK aside."""
+    spare = energy.clamp(min=0) + _SLACK
+    return torch.where(change < 0, spare / (-change).clamp(min=1e-300), math.inf).amin(-1)
 
 
 def _distance(change: Tensor) -> Tensor:
