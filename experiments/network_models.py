@@ -1,4 +1,4 @@
-"""Master equations of triangular lattices on fresh lattices: every model's distance beside that of two ensembles."""
+"""Master equations of lattices on fresh lattices: every model's distance beside that of two ensembles."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ class Config:
     """kind of lattice"""
     size: int = 48
     """particles along each direction"""
+    motion: str = "vector"
+    """displacements along all directions, or "scalar": one"""
     n_bands: int = 16
     """shells of |q| times polarizations"""
     realizations: int = 40
@@ -46,7 +48,7 @@ class Config:
     def scene(self, strength: float, seed: int) -> tc.Scene:
         times = np.unique(np.append(np.concatenate([np.arange(0, 5, 0.5), np.arange(5, self.stop)]), self.stop))
         return tc.Scene(
-            lattice=self.lattice, shape=(self.size, self.size), n_bands=self.n_bands, realizations=self.realizations,
+            lattice=self.lattice, shape=(self.size, self.size), motion=self.motion, n_bands=self.n_bands, realizations=self.realizations,
             seed=seed, times=times[times <= self.stop].tolist(), disorder=tc.Disorder(strength=strength),
         )  # fmt: skip
 
@@ -109,7 +111,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     axis.plot(data.strength, data.two, "k:", label=f"two ensembles of {config.realizations}")
     axis.set(
         xlabel=r"disorder $\xi$", ylabel="total variation from fresh lattices", yscale="log",
-        title=f"{config.size} x {config.size} {config.lattice}, {config.n_bands} bands, 0 < $t$ ≤ {config.stop:g}",
+        title=f"{config.size} x {config.size} {config.lattice}, {config.motion}, {config.n_bands} bands, 0 < $t$ ≤ {config.stop:g}",
     )  # fmt: skip
     axis.legend(fontsize="small")
     return figure

@@ -24,7 +24,8 @@ from torchchain import network as nw
 from torchchain.chain import State
 from torchchain.network import chebyshev, layouts
 
-WAYS = ("scipy CSR", "torch CSR", "one field", "two fields")
+WAYS = ("scipy CSR", "scipy recursion", "torch CSR", "one field", "two fields")
+"""The product alone, and with the recursion 2 x + w K x - T_k-2 around it as our steps have it; torch's product alone."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Config:
     """particles along each direction of triangular lattices, and of the same with moved particles"""
     fcc: tuple[int, ...] = (60,)
     """of fcc lattices"""
+    packings: tuple[int, ...] = (60, 250, 700)
+    """disks along each direction of packings, in both motions"""
     strength: float = 0.1
     """disorder xi of the masses"""
     repeats: int = 7
@@ -49,7 +52,7 @@ class Config:
     """its end"""
 
 
-SMOKE = Config(triangular=(20,), fcc=(6,), repeats=2, size=40, stop=5.0)
+SMOKE = Config(triangular=(20,), fcc=(6,), packings=(20,), repeats=2, size=40, stop=5.0)
 
 
 def networks(config: Config) -> list[tuple[str, nw.Network]]:
@@ -61,6 +64,11 @@ def networks(config: Config) -> list[tuple[str, nw.Network]]:
             masses = tc.Disorder(strength=config.strength).masses(ordered.n_particles, 1, config.seed)[0]
             ordered = replace(ordered, masses=masses)
             made += [(f"{kind} lattice", ordered), (f"{kind}, moved", nw.displaced(ordered, 0.02, seed=config.seed))]
+    for size in config.packings:
+        grid = nw.displaced(nw.lattice("square", (size, size)), 0.35, seed=config.seed)
+        radii = torch.full((grid.n_particles,), 0.62, dtype=torch.float64)
+        disks = tc.packing(grid.positions, radii, grid.masses, [float(size)] * 2, prestress=False)
+        made += [("packing", disks), ("packing, scalar", replace(disks, motion="scalar"))]
     return made
 
 
@@ -76,7 +84,18 @@ def ways(network: nw.Network, config: Config, products: int) -> dict[str, Callab
             torch.from_numpy(matrix.indptr.astype(np.int64)), torch.from_numpy(matrix.indices.astype(np.int64)),
             torch.from_numpy(matrix.data), size=matrix.shape, check_invariants=False,
         )  # fmt: skip
-    vector = torch.from_numpy(x)
+    vector, weight = torch.from_numpy(x), np.full(n * c, -1e-3)
+    terms = [x, x.copy()]
+
+    def recursion() -> None:
+        for _ in range(products):
+            new = matrix @ terms[1]
+            new *= weight
+            new += terms[1]
+            new += terms[1]
+            new -= terms[0]
+            terms[:] = terms[1], new
+
     top = float(chebyshev.highest_frequency(network))
     layout = layouts.layout_of(network)
     run = layout.bind(0, top)
@@ -88,21 +107,20 @@ def ways(network: nw.Network, config: Config, products: int) -> dict[str, Callab
         sums, table = layout.sums(0), np.zeros((0, products + 1, 2, fields))
 
         def go() -> None:
+            if config.threads == 1 or network.n_unknowns < chebyshev.SPLIT:
+                run((1, products + 1), products, 0, layout.parts, cells, sums, table)
+                return
             for k in range(1, products + 1):
-                if config.threads == 1 or network.n_unknowns < chebyshev.SPLIT:
-                    run((k, k + 1), products, 0, layout.parts, cells, sums, table)
-                else:
-                    parts = range(config.threads)
-                    list(
-                        pool.map(
-                            lambda i, k=k: run((k, k + 1), products, cuts[i], cuts[i + 1], cells, sums, table), parts
-                        )
-                    )
+                parts = range(config.threads)
+                list(
+                    pool.map(lambda i, k=k: run((k, k + 1), products, cuts[i], cuts[i + 1], cells, sums, table), parts)
+                )
 
         return go
 
     return {
         "scipy CSR": lambda: [matrix @ x for _ in range(products)],
+        "scipy recursion": recursion,
         "torch CSR": lambda: [theirs @ vector for _ in range(products)],
         "one field": steps(1),
         "two fields": steps(2),
@@ -124,7 +142,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     names, unknowns, rates = [], [], []
     for name, network in networks(config):
-        products = max(3, min(60, int(3e6 / network.n_bonds)))
+        products = max(12, min(60, int(3e6 / network.n_bonds)))
         seconds = in_turn(ways(network, config, products), config.repeats, time.process_time)
         work = {way: products * network.n_bonds * (2 if way == "two fields" else 1) for way in WAYS}
         names.append(name)
@@ -147,10 +165,10 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 def draw(data: xarray.Dataset, config: Config) -> Figure:
     figure, axes = harness.panels(1, 1, width=6)
     axis = axes[0, 0]
-    for way, marker in zip(WAYS, "sDov", strict=True):
+    for way, marker in zip(WAYS, "spDov", strict=True):
         for style in ("lattice", "moved"):
             pick = [i for i, name in enumerate(data.name.values) if str(name).endswith(style) and "tri" in str(name)]
-            label = f"{way}, {style}" if way in WAYS[2:] else (way if style == "moved" else None)
+            label = f"{way}, {style}" if way in WAYS[3:] else (way if style == "moved" else None)
             if pick and label:
                 line = "-" if style == "lattice" else "--"
                 axis.plot(data.unknowns[pick], data.rate.sel(way=way)[pick] / 1e6, line + marker, label=label)
@@ -165,7 +183,7 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
         rate = {way: float(data.rate.sel(way=way)[i]) for way in WAYS}
         note = f"torch {rate['torch CSR'] / 1e6:.0f}, one field {rate['one field'] / 1e6:.0f}, two {rate['two fields'] / 1e6:.0f}"
         rows.append(Row(f"{name}, {unknowns} unknowns: scipy CSR, 1e6 bonds / s", rate["scipy CSR"] / 1e6, note=note))
-        for other in WAYS[:2]:
+        for other in WAYS[:3]:
             both = f"one field {rate['one field'] / rate[other]:.1f}"
             rows.append(Row(f"    two fields over {other}", rate["two fields"] / rate[other], note=both))
     rows.append(

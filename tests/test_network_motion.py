@@ -98,6 +98,25 @@ def test_renumbering_leaves_the_particles_in_place(monkeypatch):
     assert far(before, nw.evolve(network, state, TIMES, "chebyshev")) < rounding
 
 
+@pytest.mark.parametrize("motion", nw.networks.MOTIONS)
+def test_steps_of_one_sweep_are_those_made_one_by_one(motion, monkeypatch):
+    monkeypatch.setattr(layouts, "TILE", layouts.WINDOW)
+    monkeypatch.setattr(layouts, "RENUMBER", 0)
+    grid = nw.displaced(nw.lattice("square", (64, 12)), 0.3, seed=3)  # particles with none to many neighbors
+    radii = torch.full((grid.n_particles,), 0.62, dtype=torch.float64)
+    disks = tc.packing(grid.positions, radii, grid.masses, [64.0, 12.0], prestress=False)
+    network = replace(disks, motion=motion)
+    state = random_state(network)
+    swept = layouts.Gathered(network)
+    assert swept.depth > 2 and swept.lag > 1 and swept.parts > 2 * swept.lag
+    together = nw.evolve(network, state, [5.0], "chebyshev")
+    monkeypatch.setattr(layouts, "SWEPT", 0.0)
+    assert layouts.Gathered(network).depth == 1
+    apart = nw.evolve(network, state, [5.0], "chebyshev")
+    assert torch.equal(together.displacement, apart.displacement) and torch.equal(together.velocity, apart.velocity)
+    assert far(together, nw.evolve(network, state, [5.0], "chebyshev", compiled=False)) < 1e-10
+
+
 @pytest.mark.parametrize("lattice", [True, False])
 def test_threads_share_a_network_and_change_no_bit(lattice, monkeypatch):
     network = disordered("triangular") if lattice else plain(disordered("triangular"))

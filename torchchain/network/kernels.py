@@ -24,83 +24,124 @@ _U = np.uint64
 
 
 @_kernel
-def _terms(k, last, table):
-    """How many of T_k-2, T_k-1, T_k are added at step k, and their factors (output, 3, 2, field)."""
-    count = 3 if k % 3 == 2 else (k % 3 + 1 if k == last else 0)
+def _count(k, last):
+    """How many of T_k-2, T_k-1, T_k are added at step k."""
+    return 3 if k % 3 == 2 else (k % 3 + 1 if k == last else 0)
+
+
+@_kernel
+def _terms(k, count, table):
+    """Their factors (output, 3, 2, field)."""
     terms = np.zeros((len(table), 3, 2, table.shape[3]))
     for back in range(count):
         terms[:, 2 - back] = table[:, k - back]
-    return count, terms
+    return terms
 
 
 @lru_cache
-def gathered(components: int, fields: int):
+def gathered(components: int, fields: int, signed: bool, prestressed: bool):
     """The kernel for so many components of one or two fields, known when it is compiled: loops over them unroll.
 
-    It makes some steps on particles begin to end - 1, a tile at a time, the sums added to while the tile is in cache:
+    It makes some steps on tiles begin to end - 1, the sums added to while a tile is in cache. Of all tiles, several steps
+    are made in one sweep through memory: each follows the one before it at the distance that neighbors need (the "matrix
+    powers kernel", Mohiyuddin, Hoemmen, Demmel and Yelick, SC 2009), with the result of one after the other.
 
         steps: the steps k, as a range (first, after the last); step k makes T_k of T_k-1 and T_k-2.
         last: the last step of all, at which the terms not yet added are.
-        tile: particles treated at a time.
         cells: (2, particle, column), T_k in cells[k % 2]; columns are (field, component), fields T u, T v, or both.
-        weight: 4 / (W^2 m), (particle,).
-        starts, ends: neighbors of particle p are ends[starts[p] : starts[p + 1]], as offsets into the flat cells.
-        stiff, directions, across: of each of these bonds, with one component its k; with more the sign of k - T / L
-            (empty where none is negative), n times the root of its size (slot and component,), and T / L (empty without tension).
-        keep: scratch (tile, column).
         sums: (output, 2, particle, component), displacement and velocity.
         table: (output, term, 2, field), what each T of each field contributes to displacement and velocity.
+        keep: scratch (particles of a tile, column).
+        depth: steps of one sweep.
+        lag: tiles by which a step of a sweep follows the one before it.
+        tiles: runs of tile t are tiles[t] to tiles[t + 1] - 1, (tile + 1,).
+        runs: particles of run r, which have equally many neighbors, are runs[r] to runs[r + 1] - 1, (run + 1,).
+        starts, ends: neighbors of particle p are ends[starts[p] : starts[p + 1]], as offsets into the flat cells.
+        weight: 4 / (W^2 m), (particle,).
+        stiff, directions, across: of each of these bonds, with one component its k; with more the sign of k - T / L
+            (looked at where ``signed``: some are negative), n times the root of its size (slot and component,), and T / L
+            (where ``prestressed``).
     """
     columns, width = components * fields, _U(components * fields)
     slot, nothing, origin = _U(components), (0.0,) * columns, (0.0,) * components
 
     @_kernel
-    def run(steps, last, begin, end, cells, sums, table, keep, ends, tile, weight, starts, stiff, directions, across):
-        prestressed, signed = len(across) > 0, len(stiff) > 0
-        for k in range(steps[0], steps[1]):
-            old, now = cells[k % 2], cells[(k + 1) % 2]
-            to, of, first = old.reshape(-1), now.reshape(-1), k == 1
-            count, terms = _terms(k, last, table)
-            for low in range(begin, end, tile):
-                high = min(low + tile, end)
-                if count:
-                    for p in range(low, high):
+    def one(first, old, now, low, high, runs, starts, ends, weight, stiff, directions, across):
+        """One step on the runs low to high - 1."""
+        to, of = old.reshape(-1), now.reshape(-1)
+        for run in range(low, high):
+            s = _U(starts[runs[run]])
+            neighbors = _U(starts[runs[run] + 1]) - s
+            for p in range(_U(runs[run]), _U(runs[run + 1])):
+                at = width * p
+                x, force = nothing, nothing
+                for c in range(columns):
+                    x = tuple_setitem(x, c, of[at + _U(c)])
+                for _ in range(neighbors):
+                    q = _U(ends[s])
+                    if components == 1:
                         for c in range(columns):
-                            keep[p - low, c] = old[p, c]
-                for p in range(_U(low), _U(high)):
-                    at = width * p
-                    x, force = nothing, nothing
-                    for c in range(columns):
-                        x = tuple_setitem(x, c, of[at + _U(c)])
-                    for s in range(_U(starts[p]), _U(starts[p + _U(1)])):
-                        q = _U(ends[s])
-                        if components == 1:
-                            for c in range(columns):
-                                force = tuple_setitem(force, c, force[c] + stiff[s] * (of[q + _U(c)] - x[c]))
-                            continue
-                        n = origin
+                            force = tuple_setitem(force, c, force[c] + stiff[s] * (of[q + _U(c)] - x[c]))
+                        s += _U(1)
+                        continue
+                    n = origin
+                    for a in range(components):
+                        n = tuple_setitem(n, a, directions[slot * s + _U(a)])
+                    for r in range(0, columns, components):
+                        apart, pull = origin, 0.0
                         for a in range(components):
-                            n = tuple_setitem(n, a, directions[slot * s + _U(a)])
-                        for r in range(0, columns, components):
-                            apart, pull = origin, 0.0
+                            apart = tuple_setitem(apart, a, of[q + _U(r + a)] - x[r + a])
+                            pull += n[a] * apart[a]
+                        if signed:
+                            pull *= stiff[s]
+                        for a in range(components):
+                            force = tuple_setitem(force, r + a, force[r + a] + n[a] * pull)
+                        if prestressed:
                             for a in range(components):
-                                apart = tuple_setitem(apart, a, of[q + _U(r + a)] - x[r + a])
-                                pull += n[a] * apart[a]
-                            if signed:
-                                pull *= stiff[s]
-                            for a in range(components):
-                                force = tuple_setitem(force, r + a, force[r + a] + n[a] * pull)
-                            if prestressed:
-                                for a in range(components):
-                                    force = tuple_setitem(force, r + a, force[r + a] + across[s] * apart[a])
-                    w = weight[p]
-                    for c in range(columns):
-                        if first:
-                            to[at + _U(c)] = x[c] + 0.5 * w * force[c]
-                        else:
-                            to[at + _U(c)] = w * force[c] + (2.0 * x[c] - to[at + _U(c)])
-                if count:
-                    _add(low, high, keep, old, now, fields, sums, terms)
+                                force = tuple_setitem(force, r + a, force[r + a] + across[s] * apart[a])
+                    s += _U(1)
+                w = weight[p]
+                for c in range(columns):
+                    if first:
+                        to[at + _U(c)] = x[c] + 0.5 * w * force[c]
+                    else:
+                        to[at + _U(c)] = w * force[c] + (2.0 * x[c] - to[at + _U(c)])
+
+    @_kernel
+    def run(
+        steps, last, begin, end, cells, sums, table, keep, depth, lag, tiles, runs, starts, ends, weight, stiff, directions, across
+    ):  # fmt: skip
+        for start in range(steps[0], steps[1], depth):
+            deep = min(depth, steps[1] - start)
+            for front in range(begin, end + (deep - 1) * lag):
+                for behind in range(deep):
+                    tile = front - behind * lag
+                    if not begin <= tile < end:
+                        continue
+                    k = start + behind
+                    old, now = cells[k % 2], cells[(k + 1) % 2]
+                    low, high = runs[tiles[tile]], runs[tiles[tile + 1]]
+                    count = _count(k, last)
+                    if count:
+                        for p in range(low, high):
+                            for c in range(columns):
+                                keep[p - low, c] = old[p, c]
+                    one(
+                        k == 1,
+                        old,
+                        now,
+                        tiles[tile],
+                        tiles[tile + 1],
+                        runs,
+                        starts,
+                        ends,
+                        weight,
+                        stiff,
+                        directions,
+                        across,
+                    )
+                    if count:
+                        _add(low, high, keep, old, now, fields, sums, _terms(k, count, table))
 
     return run
 
@@ -155,7 +196,8 @@ def rows(
     width, fields = len(force), cells.shape[1] // components
     for k in range(steps[0], steps[1]):
         old, now = cells[k % 2], cells[(k + 1) % 2]
-        count, terms = _terms(k, last, table)
+        count = _count(k, last)
+        terms = _terms(k, count, table)
         for row in range(begin, end):
             for r in range(fields):
                 base = components * r

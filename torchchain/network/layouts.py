@@ -14,7 +14,9 @@ from torch import Tensor
 from torchchain.network.lattices import PRIMITIVE, STEPS, Lattice
 from torchchain.network.networks import Network
 
-TILE = 512  # particles whose terms are added to the sums while they are in cache
+TILE = 512  # particles treated together, whose terms are added to the sums while they are in cache
+WINDOW = 64  # particles sorted by their number of neighbors, so that processors foresee the ends of loops; divides TILE
+DEEPEST, SWEPT = 8, 8e6  # steps of one sweep through memory, at most, and the bytes they may hold in cache
 RENUMBER = 2_000  # particles from which a network is renumbered for the cache
 NARROW = 40  # particles in a row below which loops along it do not pay
 PAD = 1
@@ -23,7 +25,7 @@ Run = Callable[..., None]
 
 
 class Layout(Protocol):
-    """Numbers of one network laid out for a kernel."""
+    """Numbers of one network laid out for a kernel, which treats ``parts`` pieces of it one by one."""
 
     parts: int
 
@@ -56,14 +58,26 @@ class Gathered:
             near = end < n
             graph = coo_matrix((np.ones(near.sum(), np.int8), (owner[near], end[near])), shape=(n, n)).tocsr()
             self.order = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
+        neighbors = np.bincount(owner, minlength=n)[self.order]
+        window = np.arange(n) // WINDOW
+        sort = np.lexsort((-neighbors, window))
+        self.order, neighbors = self.order[sort], neighbors[sort]
         place = np.empty(n + 1, np.int64)
         place[self.order], place[n] = np.arange(n), n
         owner, end = place[owner], place[end]
         sort = np.lexsort((end, owner))
         self.ends, self.bond = end[sort], bond[sort]
         self._offsets: dict[int, np.ndarray] = {}
-        self.starts = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=n))]).astype(np.uint64)
-        self.parts, self.components = n, c
+        self.starts = np.concatenate([[0], np.cumsum(neighbors)]).astype(np.uint64)
+        new = (np.diff(neighbors, prepend=-1) != 0) | (np.diff(window, prepend=-1) != 0)
+        self.runs = np.append(np.flatnonzero(new), n)
+        self.tiles = np.searchsorted(self.runs, np.append(np.arange(0, n, TILE), n))
+        self.parts, self.n, self.components = len(self.tiles) - 1, n, c
+        inside = self.ends < n
+        apart = int(np.abs(self.ends - owner[sort])[inside].max(initial=0))
+        self.lag = max(1, -(-apart // TILE))
+        held = self.lag * TILE * (8 * (4 * c + 1) + len(self.ends) / n * (4 + 8 * c))
+        self.depth = int(np.clip(SWEPT / held, 1, DEEPEST))
         self.masses = _flat(network.masses)[:, self.order]
         self.stiffness = _flat(network.bond_stiffness)
         self.across = _flat(network.bond_tension / network.lengths) if network.is_prestressed else None
@@ -73,18 +87,18 @@ class Gathered:
     def _ends(self, columns: int) -> np.ndarray:
         """The neighbors as offsets into cells with so many columns."""
         if columns not in self._offsets:
-            kind = np.uint32 if (self.parts + 1) * columns < 2**32 else np.uint64
+            kind = np.uint32 if (self.n + 1) * columns < 2**32 else np.uint64
             self._offsets[columns] = (self.ends * columns).astype(kind)
         return self._offsets[columns]
 
     def cells(self, fields: list[np.ndarray]) -> np.ndarray:
-        cells = np.zeros((2, self.parts + 1, len(fields) * self.components))
+        cells = np.zeros((2, self.n + 1, len(fields) * self.components))
         for r, values in enumerate(fields):
             cells[0, :-1, r * self.components : (r + 1) * self.components] = values[self.order]
         return cells
 
     def sums(self, outputs: int) -> np.ndarray:
-        return np.zeros((outputs, 2, self.parts, self.components))
+        return np.zeros((outputs, 2, self.n, self.components))
 
     def bind(self, member: int, frequency: float) -> Run:
         from torchchain.network import kernels  # imports Numba
@@ -98,13 +112,15 @@ class Gathered:
             directions = (directions * np.sqrt(np.abs(stiff))[:, None]).reshape(-1)
             stiff = np.sign(stiff) if stiff.min(initial=0) < 0 else np.zeros(0)
 
-        def scratch(cells: np.ndarray) -> tuple[np.ndarray, ...]:
-            return (np.empty((TILE, cells.shape[2])), self._ends(cells.shape[2]))
+        def scratch(cells: np.ndarray) -> tuple[Any, ...]:
+            columns, sweep = cells.shape[2], (self.depth, self.lag, self.tiles, self.runs, self.starts)
+            return (np.empty((TILE, columns)), *sweep, self._ends(columns))
 
         def kernel(cells: np.ndarray) -> Any:
-            return kernels.gathered(self.components, cells.shape[2] // self.components)
+            fields = cells.shape[2] // self.components
+            return kernels.gathered(self.components, fields, len(stiff) > 0, len(across) > 0)
 
-        return _bound(kernel, scratch, TILE, weight, self.starts, stiff, directions, across)
+        return _bound(kernel, scratch, weight, stiff, directions, across)
 
     def read(self, sums: np.ndarray) -> np.ndarray:
         out = np.empty_like(sums)
