@@ -100,6 +100,7 @@ def ways(network: nw.Network, config: Config, products: int) -> dict[str, Callab
     layout = layouts.layout_of(network)
     run = layout.bind(0, top)
     pool = ThreadPoolExecutor(config.threads)
+    parts = range(config.threads)
     cuts = [layout.parts * i // config.threads for i in range(config.threads + 1)]
 
     def steps(fields: int) -> Callable[[], None]:
@@ -111,7 +112,6 @@ def ways(network: nw.Network, config: Config, products: int) -> dict[str, Callab
                 run((1, products + 1), products, 0, layout.parts, cells, sums, table)
                 return
             for k in range(1, products + 1):
-                parts = range(config.threads)
                 list(
                     pool.map(lambda i, k=k: run((k, k + 1), products, cuts[i], cuts[i + 1], cells, sums, table), parts)
                 )

@@ -108,12 +108,15 @@ def test_steps_of_one_sweep_are_those_made_one_by_one(motion, monkeypatch):
     network = replace(disks, motion=motion)
     state = random_state(network)
     swept = layouts.Gathered(network)
-    assert swept.depth > 2 and swept.lag > 1 and swept.parts > 2 * swept.lag
+    assert swept.depth > 2
+    assert swept.lag > 1
+    assert swept.parts > 2 * swept.lag
     together = nw.evolve(network, state, [5.0], "chebyshev")
     monkeypatch.setattr(layouts, "SWEPT", 0.0)
     assert layouts.Gathered(network).depth == 1
     apart = nw.evolve(network, state, [5.0], "chebyshev")
-    assert torch.equal(together.displacement, apart.displacement) and torch.equal(together.velocity, apart.velocity)
+    assert torch.equal(together.displacement, apart.displacement)
+    assert torch.equal(together.velocity, apart.velocity)
     assert far(together, nw.evolve(network, state, [5.0], "chebyshev", compiled=False)) < 1e-10
 
 
