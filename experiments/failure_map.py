@@ -31,6 +31,7 @@ from torchchain.master.solving import ADAMS_ITERATIONS, ADAMS_STEPS, STABILITY
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 BLOWN_UP = 1e3
+RIGHT = "is right: the idealization is not"
 ITERATED = ("implicit_adams", "fixed_adams")
 STEPS = 1500  # of a step tried for stability: 1e-4 beyond the edge is found
 
@@ -61,7 +62,7 @@ class Edge:
         badness: what goes wrong at a value, by the method's own step without any guard; not a number counts as wrong.
         limit: of the badness.
         bracket: the search's first and last value over the predicted one.
-        public: the same through the library's front door; None where a finite chain is right and an infinite one is not.
+        public: the same through the library's front door; None where what fails is an idealization and the library is right.
     """
 
     method: str
@@ -124,6 +125,7 @@ def edges(seed: int) -> list[Edge]:
         _mass_ratio(),
         *_finite_chains(),
         _open_contacts(),
+        *_hertz_waves(),
     ]
 
 
@@ -479,6 +481,41 @@ def _open_contacts() -> Edge:
     )  # fmt: skip
 
 
+def _hertz_waves() -> list[Edge]:
+    """Traveling waves in an ordered Hertz chain: where they are no longer linear, and where no longer of second order.
+
+    The second harmonic beats up to (A^2 / 4) cot(k / 2), of the energy (2 cos(k / 2) cot(k / 2) A / 4)^2; the expansion in the
+    elongation ends where a contact opens, 2 A sin(k / 2) = 1 if it did not steepen.
+    """
+    n, tone = 64, 5
+    k = 2 * math.pi * tone / n
+    chain = tc.Chain(torch.ones(n, dtype=torch.float64), contact="hertz")
+    phase = k * torch.arange(n, dtype=torch.float64)
+    beat = 4 * math.sin(k / 2) * (1 - math.cos(k / 2))
+
+    def path(value: float, times: Tensor) -> tc.Trajectory:
+        start = tc.State(value * phase.cos(), value * 2 * math.sin(k / 2) * phase.sin())
+        return tc.evolve(chain, start, times, "symplectic4", step=0.1)
+
+    def harmonic(value: float) -> float:
+        motion = path(value, torch.tensor([math.pi / beat], dtype=torch.float64))
+        double = 2 * math.sin(k)
+        wave, speed = (torch.fft.fft(x[0])[2 * tone] / n for x in (motion.displacement, motion.velocity))
+        right = float((wave - speed / (1j * double)).abs())
+        return (double * right / (2 * math.sin(k / 2) * value)) ** 2
+
+    def stretch(value: float) -> float:
+        return float(chain.elongation(path(value, torch.linspace(0, 20, 81, dtype=torch.float64)).displacement).max())
+
+    share = 0.01
+    return [
+        Edge("Hertz contacts as linear", f"amplitude until the second harmonic has {share:g} of the energy",
+             4 * share**0.5 / (2 * math.cos(k / 2) / math.tan(k / 2)), "second-order perturbation theory", 1.02, harmonic, share, (0.5, 2.0), None),
+        Edge("Hertz contacts to second order", "amplitude until a contact opens", 1 / (2 * math.sin(k / 2)),
+             "elongation 2 A sin(k / 2) = 1, of a wave that has not steepened", 1.2, stretch, 1.0, (0.3, 1.5), None),
+    ]  # fmt: skip
+
+
 def measure(config: Config, device: str) -> xarray.Dataset:
     if device != "cpu":
         raise checks.fail("device", "be 'cpu': the edges are the methods', not the device's", repr(device))
@@ -515,13 +552,13 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 def kind(text: str, by_design: bool) -> str:
     """How the library meets what lies beyond an edge."""
     if by_design:
-        return "is right: a finite chain is not infinite"
+        return RIGHT
     if not text:
         return "silent"
     return "warns" if "Warning" in text.partition(":")[0] else "raises"
 
 
-COLORS = {"raises": "C0", "warns": "C1", "is right: a finite chain is not infinite": "0.5", "silent": "C3"}
+COLORS = {"raises": "C0", "warns": "C1", RIGHT: "0.5", "silent": "C3"}
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
