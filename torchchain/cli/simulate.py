@@ -71,7 +71,8 @@ def _last(data: xarray.Dataset, name: str) -> tuple[str, float, float] | None:
         place = int(values.values.argmax())
         axis = values.dims[0]
         values, error = values[place], error[place]
-        when += f", largest ({axis} {float(data[axis][place]):g})"
+        where = data[axis].values[place]
+        when += f", largest ({axis} {where if isinstance(where, str) else f'{float(where):g}'})"
     return f"{name}{when}", float(values), float(error)
 
 
