@@ -16,7 +16,7 @@ from torch import Tensor
 
 import torchchain as tc
 from torchchain.ensemble.fused import band_energy
-from torchchain.ensemble.scene import regular_times
+from torchchain.ensemble.scene_file import regular_times
 
 EARLY = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
 DENSE = regular_times(0.0, 5.0, 0.25)

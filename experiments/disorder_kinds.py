@@ -22,7 +22,7 @@ from torchchain import plots
 from torchchain.chain.disorder import KINDS
 from torchchain.energy.bands import band_of
 from torchchain.ensemble import run as ensemble
-from torchchain.ensemble.scene import regular_times
+from torchchain.ensemble.scene_file import regular_times
 
 CASES = (*KINDS, "normal again", "stiffness", "both")  # the second normal ensemble shows what chance does
 NONE = tc.Disorder(strength=0.0)

@@ -16,7 +16,7 @@ from harness import Row
 from matplotlib.figure import Figure
 
 from torchchain import plots
-from torchchain.ensemble.scene import regular_times
+from torchchain.ensemble.scene_file import regular_times
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from torch import Tensor
 import torchchain as tc
 from torchchain import checks, plots
 from torchchain.cli import outputs
-from torchchain.ensemble.scene import read_toml, regular_times
+from torchchain.ensemble.scene_file import read_toml, regular_times
 from torchchain.ensemble.statistics import jackknife_error
 
 TIME = {"units": "travel time of sound over one particle", "long_name": "time t"}

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 
 import torchchain as tc
 from torchchain import plots
-from torchchain.ensemble.scene import regular_times
+from torchchain.ensemble.scene_file import regular_times
 
 NAMES = {
     "center": "center R",

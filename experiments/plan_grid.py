@@ -20,7 +20,8 @@ from torchchain import checks
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.plan import Choice
 from torchchain.ensemble.predictions import Facts, cost, error_of, settle
-from torchchain.ensemble.scene import describe, regular_times
+from torchchain.ensemble.scene_file import regular_times
+from torchchain.ensemble.scene_words import describe
 from torchchain.evolvers import METHODS
 
 IN_SPACE = ("center", "width", "energy", "displacement", "total_energy", "source_energy")

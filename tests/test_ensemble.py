@@ -12,7 +12,7 @@ from torchchain.checks import FieldError, FieldTypeError
 from torchchain.ensemble import observables
 from torchchain.ensemble.layout import layout
 from torchchain.ensemble.run import stream
-from torchchain.ensemble.scene import describe
+from torchchain.ensemble.scene_words import describe
 from torchchain.ensemble.stages import Stages
 
 OBSERVABLES = [name for name, entry in observables.OBSERVABLES.items() if "chain" in entry.kinds]

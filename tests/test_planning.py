@@ -13,7 +13,7 @@ from torchchain.ensemble import layout, predictions
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.moving_part import PartExceeded, moving_part
 from torchchain.ensemble.plan import forecast
-from torchchain.ensemble.scene import regular_times
+from torchchain.ensemble.scene_file import regular_times
 from torchchain.evolvers import start
 from torchchain.master.stand_in import plan
 

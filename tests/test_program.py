@@ -158,7 +158,7 @@ def test_help_lists_what_there_is():
     from torchchain.chain.chain import BOUNDARIES, CONTACTS
     from torchchain.chain.disorder import KINDS
     from torchchain.energy import DEFINITIONS
-    from torchchain.ensemble.scene import EXCITATIONS
+    from torchchain.ensemble.scene_file import EXCITATIONS
 
     assert choices.KINDS == KINDS
     assert choices.BOUNDARIES == BOUNDARIES

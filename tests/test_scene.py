@@ -7,7 +7,8 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.ensemble.scene import describe, read_toml, regular_times
+from torchchain.ensemble.scene_file import read_toml, regular_times
+from torchchain.ensemble.scene_words import describe
 
 
 def test_the_defaults_are_the_papers_case():

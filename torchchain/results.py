@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from torchchain import checks
-from torchchain.ensemble.scene import Scene, read_toml
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_file import read_toml
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import MasterEquation, MasterFamily
 

@@ -20,7 +20,7 @@ from torchchain.cli.report import shares_left
 from torchchain.cli.runs import Run, config_of, merged_tables, running, scene_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.measured_transfer import band_transfer, measured_observables
-from torchchain.ensemble.scene import describe
+from torchchain.ensemble.scene_words import describe
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import Calibration, MasterEquation, calibrate

@@ -18,7 +18,8 @@ from torchchain.cli import choices, outputs
 from torchchain.cli.flags import Predict
 from torchchain.cli.runs import config_of, merged_tables
 from torchchain.energy import StartEnergy, excited, start_energy
-from torchchain.ensemble.scene import Scene, regular_times
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_file import regular_times
 from torchchain.ensemble.stages import Stages
 from torchchain.master import SOLVERS, MasterEquation, MasterFamily
 from torchchain.results import model_file

@@ -22,7 +22,7 @@ from torchchain.cli.imports import run_import
 from torchchain.cli.predict import run_predict
 from torchchain.cli.simulate import run_simulate
 from torchchain.ensemble import ranks
-from torchchain.ensemble.scene import read_toml
+from torchchain.ensemble.scene_file import read_toml
 from torchchain.results import read_dataset
 
 COMMANDS = ("simulate", "calibrate", "predict", "import")

@@ -20,7 +20,8 @@ from torchchain.ensemble import plan as planning
 from torchchain.ensemble import ranks
 from torchchain.ensemble.checkpoint import Checkpoint, Interrupted
 from torchchain.ensemble.measured_transfer import THEORY
-from torchchain.ensemble.scene import Scene, read_toml
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_file import read_toml
 from torchchain.ensemble.stages import Stages
 from torchchain.evolvers import METHODS
 

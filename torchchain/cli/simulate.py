@@ -12,7 +12,8 @@ from torchchain.cli import outputs
 from torchchain.cli.flags import Simulate
 from torchchain.cli.runs import Run, config_of, running, scene_of
 from torchchain.ensemble import plan as planning
-from torchchain.ensemble.scene import Scene, describe
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_words import describe
 from torchchain.ensemble.simulation import simulate
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ from torchchain.ensemble.mixed_starts import unmixed
 from torchchain.ensemble.provenance import Provenance
 from torchchain.ensemble.ranks import ALONE, Ranks
 from torchchain.ensemble.run import ensemble_moments
-from torchchain.ensemble.scene import Scene, describe
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_words import describe
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.starts import measurable, start_transfer
 from torchchain.ensemble.statistics import EnsembleMoments

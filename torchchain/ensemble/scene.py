@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
 import tomli_w
 import torch
 from torch import Tensor
@@ -24,6 +22,16 @@ from torchchain.chain.states import State
 from torchchain.energy.bands import band_of, center_tones, check_bands
 from torchchain.ensemble.observables import OBSERVABLES, chosen_observables
 from torchchain.ensemble.printed import Printed
+from torchchain.ensemble.scene_checks import (
+    check_excitation,
+    check_lattice,
+    check_mixture,
+    check_observables,
+    check_records,
+    left_out,
+)
+from torchchain.ensemble.scene_file import OF_LATTICES, OF_MIXTURES, dict_of, fields_of, read_toml, regular_times
+from torchchain.ensemble.scene_words import rows_of
 from torchchain.evolvers import METHODS, Method
 from torchchain.network.evolvers import METHODS as NETWORK_METHODS
 from torchchain.network.lattices import BOUNDARIES as LATTICE_BOUNDARIES
@@ -34,14 +42,8 @@ from torchchain.species.mixtures import MixedChain, Mixture, Species
 from torchchain.spelling import suggestion
 
 System = TypeVar("System", Lattice, MixedChain)
-EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse, "standing_wave": StandingWave}
 LARGEST_CHAIN = 10**8
-MOST_TIMES = 10**7
 LATEST_TIME = 1e12
-OF_LATTICES = {"shape": None, "motion": "vector", "removed_bonds": 0.0, "position_disorder": 0.0}
-"""Fields that lattices alone have, with their defaults."""
-OF_MIXTURES = {"species": (), "arrangement": "random", "unlike": None, "by_species": False}
-"""Fields that mixtures of species alone have, with their defaults."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -158,28 +160,24 @@ class Scene(Printed):
             object.__setattr__(self, name, value)
 
         if self.lattice is None:
-            self._left_out(OF_LATTICES, "a lattice")
+            left_out(self, OF_LATTICES, "a lattice")
             put("n_particles", 256 if self.n_particles is None else self.n_particles)
             put("n_bands", 32 if self.n_bands is None else self.n_bands)
         else:
-            self._check_lattice(put)
+            check_lattice(self, put)
         put("n_particles", checks.integer("n_particles", self.n_particles, 2, LARGEST_CHAIN))
         if not isinstance(self.species, (list, tuple)):
             raise checks.FieldTypeError(f"species must be a list of species, got {checks.shown(self.species)}")
         put("species", tuple(Species.of(each) for each in self.species))
         if self.species:
-            self._check_mixture(put)
+            check_mixture(self, put)
         else:
-            self._left_out(OF_MIXTURES, "species")
+            left_out(self, OF_MIXTURES, "species")
         checks.choice("boundary", self.boundary, BOUNDARIES if self.lattice is None else LATTICE_BOUNDARIES)
         put("realizations", checks.integer("realizations", self.realizations, 1, 10**9))
         put("seed", checks.integer("seed", self.seed, 0, 2**64 - 1))
         put("n_bands", checks.integer("n_bands", self.n_bands, 1))
-        for name, kinds, example in _RECORDS:
-            value = getattr(self, name)
-            if not isinstance(value, kinds) and not (value is None and name in ("stiffness_disorder", "si")):
-                words = " or ".join(f"{'an' if kind is Impulse else 'a'} {kind.__name__}" for kind in kinds)
-                raise checks.FieldTypeError(f"{name} must be {words}, e.g. {example}, got {checks.shown(value)}")
+        check_records(self)
         put("times", checks.times("times", self.times).to(torch.float64))
         late = self.times > LATEST_TIME
         checks.first_bad("times", f"be at most {LATEST_TIME:g}, where rounding blurs phases", self.times, late)
@@ -196,7 +194,7 @@ class Scene(Printed):
         put("observables", tuple(checks.choice("observables", name, OBSERVABLES) for name in self.observables))
         if len(set(self.observables)) < len(self.observables):
             raise checks.fail("observables", "be different", self.observables)
-        self._check_excitation()
+        check_excitation(self)
         if self.needs_bands and self.lattices is not None:
             self.lattices.bands(self.n_bands)
         elif self.needs_bands:
@@ -206,83 +204,9 @@ class Scene(Printed):
                 wave.check(self.n_particles)
             elif isinstance(self.excitation, StandingWave):  # the center tone of the last band can be N/2
                 dataclasses.replace(self.excitation, tones=self.tones).check(self.n_particles)
-        for entry in chosen_observables(self.observables):
-            of = f"for the observable {entry.name}"
-            own = {self.kind, "mixture"} if self.species else {self.kind}
-            if not own & set(entry.kinds):
-                several = ", ".join(n for n, o in OBSERVABLES.items() if own & set(o.kinds))
-                raise checks.fail("observables", f"be of {self.kind}s ({several})", repr(entry.name))
-            if entry.wavenumbers and self.by_species and entry.name != "band_energy":
-                raise checks.fail("by_species", f"be False {of}", True)
-            if entry.wavenumbers and self.contact == "hertz":
-                raise checks.fail("contact", f"be 'linear' {of}", repr(self.contact))
-            if entry.wavenumbers and self.energy_definition == "bond" and self.boundary == "fixed" and not self.lattice:
-                raise checks.fail("boundary", f"be 'periodic' {of} by 'bond'", repr(self.boundary))
-            if not entry.damped and self.largest_damping > 0:
-                raise checks.fail("damping", f"be zero {of}", self.largest_damping)
+        check_observables(self)
         if (self.contact == "hertz" or self.lattice or self.by_species) and self.energy_definition == "site":
             put("energy_definition", "bond")  # the only one that a Hertz contact has; that of lattices in space
-
-    def _check_lattice(self, put: Callable[[str, Any], None]) -> None:
-        """Checks what lattices have of their own, and fills in what follows from it."""
-        if isinstance(self.shape, list):
-            put("shape", tuple(self.shape))
-        if self.shape is None:
-            raise checks.fail("shape", "be given for a lattice", None)
-        checks.choice("boundary", self.boundary, LATTICE_BOUNDARIES)
-        checks.number("damping", self.damping, at_least=0)
-        if self.contact == "auto":
-            put("contact", "linear")
-        if self.contact != "linear":
-            raise checks.fail("contact", "be 'linear' for a lattice", repr(self.contact))
-        if self.si is not None:
-            raise checks.fail("si", "be left out for a lattice", "beads")
-        if self.position_disorder and self.opposite_pairs:
-            raise checks.fail("opposite_pairs", "be False with position_disorder", self.opposite_pairs)
-        checks.instance("disorder", self.disorder, Disorder)
-        checks.instance("stiffness_disorder", self.stiffness_disorder, Disorder, type(None))
-        lattices = self.lattices
-        assert lattices is not None
-        n = lattices.n_particles
-        if self.n_particles not in (None, n):
-            raise checks.fail(
-                "n_particles", f"be left out for a lattice of shape {self.shape}, which has {n}", self.n_particles
-            )
-        put("n_particles", n)
-        for name in ("shape", "removed_bonds", "position_disorder"):
-            put(name, getattr(lattices, {"position_disorder": "moved"}.get(name, name)))
-        if self.n_bands is None:
-            put("n_bands", lattices.default_bands)
-
-    def _left_out(self, defaults: dict[str, Any], of: str) -> None:
-        """An error for fields of what the scene is not of."""
-        for name, default in defaults.items():
-            value = getattr(self, name)
-            if not (value is default or (isinstance(value, (str, int, float)) and value == default)):
-                raise checks.fail(name, f"be left out without {of}", checks.shown(value))
-
-    def _check_mixture(self, put: Callable[[str, Any], None]) -> None:
-        """Checks what mixtures have of their own."""
-        if isinstance(self.unlike, list):
-            put("unlike", tuple(self.unlike))
-        mixture = self.mixture
-        assert mixture is not None, "of species"
-        put("unlike", mixture.unlike)
-        if self.lattice is not None:
-            raise checks.fail("species", "be left out for a lattice", [each.name for each in self.species])
-        for name, wanted in (("damping", 0.0), ("si", None), ("opposite_pairs", False)):
-            value = getattr(self, name)
-            if value is not wanted and value != wanted:
-                rule = "be that of the species" if name == "damping" else "be left out for a mixture"
-                raise checks.fail(name, rule, checks.shown(value))
-        checks.truth("by_species", self.by_species)
-        if not self.by_species:
-            return
-        if checks.integer("n_bands", self.n_bands, 1) % len(self.species):
-            raise checks.fail("n_bands", f"be a multiple of the {len(self.species)} species", self.n_bands)
-        for name, needed in (("boundary", "periodic"), ("contact", "linear")):
-            if getattr(self, name) != needed:
-                raise checks.fail(name, f"be {needed!r} for by_species", repr(getattr(self, name)))
 
     @cached_property
     def mixture(self) -> Mixture | None:
@@ -298,13 +222,6 @@ class Scene(Printed):
     def largest_damping(self) -> float:
         """Damping of the contacts, of a mixture the largest; 0 where none is damped."""
         return self.damping if self.mixture is None else self.mixture.largest_damping
-
-    def _check_excitation(self) -> None:
-        if (self.lattice is None and not self.by_species) or isinstance(self.excitation, Impulse):
-            self.excitation.check(self.n_particles)
-            return
-        for tone in self.excitation.tones or ():
-            checks.integer("excitation.tones", tone, 1, self.n_bands)
 
     @cached_property
     def lattices(self) -> RandomLattices | None:
@@ -345,35 +262,7 @@ class Scene(Printed):
         return found if self.lattices is None else found | {"ring": len(self.lattices.ring_edges(self.site)) - 1}
 
     def _rows(self) -> dict[str, str]:
-        def words(record: Any) -> str:
-            plain = {name: value for name, value in _plain(record).items() if not isinstance(value, list)}
-            return ", ".join(f"{name} {value}" for name, value in plain.items())
-
-        wave = f"impulse: {words(self.excitation)}"
-        if isinstance(self.excitation, StandingWave):
-            wave = f"{_listed(self.tones, 'tone', 'tones')} of a standing wave: {words(self.excitation)}"
-        contacts = f"{self.contact}, damping {self.largest_damping:g}"
-        size = f"{self.boundary}, of {self.n_particles} particles"
-        if self.lattice is not None:
-            wave = wave.replace("tone", "band").replace("a standing wave", "plane waves")
-            contacts += f", {self.removed_bonds:g} of the bonds removed" if self.removed_bonds else ""
-            size = f"{_shape(self)} {self.lattice}, motion '{self.motion}', {self.boundary}"
-        if self.species:
-            size += f", of {', '.join(each.name for each in self.species)} ({self.arrangement})"
-        if self.stiffness_disorder is not None:
-            contacts += f", stiffness disorder: {words(self.stiffness_disorder)}"
-        pairs = " in opposite pairs" if self.sample_size == 2 else ""
-        rows = {
-            f"{self.kind}s": f"{self.realizations}{pairs}, {size}, seed {self.seed}",
-            "disorder": words(self.disorder),
-            "contacts": contacts,
-            "excitation": wave,
-            "times": _listed(self.times.tolist(), "time", "times"),
-            "observables": ", ".join(self.observables) + (f"; {self.n_bands} bands" if self.needs_bands else ""),
-            "energy": f"by '{self.energy_definition}'",
-            "tolerance": "the ensemble's own error" if self.tolerance is None else f"{self.tolerance:g}",
-        }
-        return rows | ({"si": words(self.si)} if self.si is not None else {})
+        return rows_of(self)
 
     @property
     def needs_bands(self) -> bool:
@@ -475,25 +364,7 @@ class Scene(Printed):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as in a scene file; fields that are None are left out."""
-        plain: dict[str, Any] = {}
-        for entry in dataclasses.fields(self):
-            value = getattr(self, entry.name)
-            if entry.name in ("n_particles", "energy_definition") if self.lattice else entry.name in OF_LATTICES:
-                continue  # of a lattice they follow, a chain has them not
-            if entry.name in OF_MIXTURES and not self.species:
-                continue
-            if entry.name == "times":
-                value = _times_table(value)
-            elif entry.name == "excitation":
-                kind = "impulse" if isinstance(value, Impulse) else "standing_wave"
-                value = {"kind": kind, **_plain(value)}
-            elif isinstance(value, (Disorder, Scaling)):
-                value = _plain(value)
-            elif isinstance(value, tuple):
-                value = [_plain(each) if isinstance(each, Species) else each for each in value]
-            if value is not None:
-                plain[entry.name] = value
-        return plain
+        return dict_of(self)
 
     def to_toml(self) -> str:
         """The scene as the text of a scene file."""
@@ -506,156 +377,12 @@ class Scene(Printed):
         The table ``si`` holds the beads (see :class:`Scaling`) and may state ``times`` in seconds, ``velocity`` in
         m/s, ``amplitude`` in meters and ``damping`` in kg/s, in place of the dimensionless fields.
         """
-        checks.known_keys("scene", plain, [entry.name for entry in dataclasses.fields(cls)])
-        for name in ("n_particles", "n_bands"):
-            if name in plain and plain[name] is None:
-                raise checks.FieldTypeError(f"{name} must be an integer, got None")
-        fields = dict(plain)
-        if "si" in fields:
-            fields = _made_dimensionless(fields)
-        for name in ("disorder", "stiffness_disorder"):
-            if name in fields:
-                fields[name] = _from_table(name, fields[name], Disorder)
-        if "excitation" in fields:
-            table = _table("excitation", fields["excitation"])
-            kind = checks.choice("excitation.kind", table.pop("kind", "standing_wave"), EXCITATIONS)
-            fields["excitation"] = _from_table("excitation", table, EXCITATIONS[kind])
-        if isinstance(fields.get("times"), Mapping):
-            fields["times"] = _times_from_table(fields["times"])
-        for name in ("observables", "shape"):
-            if isinstance(fields.get(name), list):
-                fields[name] = tuple(fields[name])
-        if isinstance(fields.get("unlike"), Sequence) and not isinstance(fields["unlike"], str):
-            fields["unlike"] = _unlike(fields["unlike"])
-        return cls(**fields)
+        return cls(**fields_of(plain, [entry.name for entry in dataclasses.fields(cls)]))
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Scene:
         """A scene from a TOML file whose keys are the fields."""
         return cls.from_dict(read_toml(path))
-
-
-def read_toml(path: str | Path) -> dict[str, Any]:
-    """The tables of a TOML file; every failure is one line that names the file."""
-    try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
-    except (ValueError, RecursionError) as error:  # broken syntax or encoding, an endless number, bottomless nesting
-        raise checks.fail(f"config {path}", "be a TOML file", f"{error}") from None
-    except OSError as error:
-        raise checks.fail(f"config {path}", "be a readable file", f"{error.strerror or error}") from None
-
-
-def regular_times(start: float, stop: float, step: float) -> Tensor:
-    """start, start + step, ... up to and including stop (within rounding), (time,) float64."""
-    start = checks.number("times.start", start, at_least=0)
-    stop = checks.number("times.stop", stop, at_least=start)
-    step = checks.number("times.step", step, above=0)
-    count = (stop - start) / step * (1 + 1e-12) + 1e-9
-    if count >= MOST_TIMES:
-        raise checks.fail("times.step", f"give fewer than {MOST_TIMES} times", step)
-    return start + step * torch.arange(int(count) + 1, dtype=torch.float64)
-
-
-def _times_from_table(value: Any) -> Tensor:
-    table = _table("times", value)
-    checks.known_keys("times", table, ("start", "stop", "step"))
-    for key in ("stop", "step"):
-        if key not in table:
-            raise checks.fail("times", f"have {key}", dict(table))
-    return regular_times(table.get("start", 0.0), table["stop"], table["step"])
-
-
-def _made_dimensionless(fields: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a scene file whose table ``si`` states some of them in SI units."""
-    table = _table("si", fields["si"])
-    given = {name: table.pop(name) for name in ("times", "velocity", "amplitude", "damping") if name in table}
-    missing = [entry.name for entry in dataclasses.fields(Scaling) if entry.name not in table]
-    if missing:
-        raise checks.fail("si", f"have {', '.join(missing)}", table)
-    scaling = _from_table("si", table, Scaling)
-    fields = {**fields, "si": scaling}
-    if "times" in given:
-        times = given["times"]
-        times = _times_from_table(times) if isinstance(times, Mapping) else checks.times("si.times", times)
-        _only_once("times", fields)
-        fields["times"] = scaling.from_si("time", times)
-    if "damping" in given:
-        _only_once("damping", fields)
-        fields["damping"] = scaling.from_si("damping", checks.number("si.damping", given["damping"], at_least=0))
-    for name, quantity in (("velocity", "velocity"), ("amplitude", "length")):
-        if name in given:
-            excitation = _table("excitation", fields.get("excitation", {}))
-            _only_once(name, excitation)
-            excitation[name] = scaling.from_si(quantity, checks.number(f"si.{name}", given[name]))
-            fields["excitation"] = excitation
-    return fields
-
-
-def _only_once(name: str, fields: Mapping[str, Any]) -> None:
-    if name in fields:
-        raise checks.fail(name, f"be given once, here or as si.{name}", fields[name])
-
-
-def _times_table(times: Tensor) -> Any:
-    """A regular grid as its table, other times as a list."""
-    if len(times) > 2:
-        start, step = float(times[0]), float(times[1] - times[0])
-        stop = float(times[-1])
-        if stop / step < MOST_TIMES and torch.equal(regular_times(start, stop, step), times):
-            return {"start": start, "stop": stop, "step": step}
-    return times.tolist()
-
-
-def _plain(record: Any) -> dict[str, Any]:
-    values = dataclasses.asdict(record)
-    return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items() if v is not None}
-
-
-def _table(field_name: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, Mapping):
-        raise checks.FieldTypeError(f"{field_name} must be a table, got {checks.shown(value)}")
-    return dict(value)
-
-
-def _from_table(field_name: str, value: Any, kind: type) -> Any:
-    table = _table(field_name, value)
-    checks.known_keys(field_name, table, [entry.name for entry in dataclasses.fields(kind)])
-    try:
-        return kind(**table)
-    except (checks.FieldError, checks.FieldTypeError) as error:
-        if field_name != "stiffness_disorder":
-            raise
-        raise type(error)(f"stiffness_{error}") from None  # a Disorder calls itself disorder
-
-
-_RECORDS: tuple[tuple[str, tuple[type, ...], str], ...] = (
-    ("disorder", (Disorder,), "tc.Disorder(strength=0.3)"),
-    ("excitation", (Impulse, StandingWave), "tc.Impulse(site=1)"),
-    ("stiffness_disorder", (Disorder,), "tc.Disorder(strength=0.3)"),
-    ("si", (Scaling,), "tc.Scaling(...)"),
-)
-
-
-def _listed(values: Sequence[float], one: str, many: str) -> str:
-    """How many values, and from where to where."""
-    if len(values) == 1:
-        return f"{one} {values[0]:g}"
-    return f"{len(values)} {many} from {values[0]:g} to {values[-1]:g}"
-
-
-def _shape(scene: Scene) -> str:
-    return " x ".join(map(str, scene.shape or ()))
-
-
-def _unlike(given: Sequence[Any]) -> Any:
-    """The contacts between species of a scene file, or the words of a flag: two numbers, or the name of a law."""
-    if len(given) == 1:
-        return given[0]
-    try:
-        return tuple(float(each) if isinstance(each, str) else each for each in given)
-    except ValueError:
-        raise checks.fail("unlike", "be a stiffness and a damping, or 'hertz'", list(given)) from None
 
 
 def _moved(network: System, device: torch.device | str, dtype: torch.dtype) -> System:
@@ -666,21 +393,3 @@ def _moved(network: System, device: torch.device | str, dtype: torch.dtype) -> S
         if entry.init and isinstance(value := getattr(network, entry.name), Tensor)
     }
     return dataclasses.replace(network, **values)
-
-
-def describe(scene: Scene) -> str:
-    """The scene in one line, for titles and logs."""
-    wave = (
-        f"impulse at particle {scene.excitation.site}"
-        if isinstance(scene.excitation, Impulse)
-        else f"{len(scene.tones)} standing waves"
-    )
-    end = np.format_float_positional(float(scene.times[-1]), trim="-")
-    pairs = " in opposite pairs" if scene.sample_size == 2 else ""
-    what = f"{scene.boundary} chains{pairs}, N = {scene.n_particles}"
-    if scene.species:
-        what += f" of {' and '.join(each.name for each in scene.species)}"
-    if scene.lattice is not None:
-        wave = wave.replace("standing", "plane")
-        what = f"{scene.boundary} {scene.lattice} lattices{pairs}, {_shape(scene)}, {scene.motion}"
-    return f"{scene.realizations} {what}, xi = {scene.disorder.strength:g}, {wave}, {len(scene.times)} times to {end}"

@@ -19,7 +19,8 @@ from torchchain.chain.states import Trajectory
 from torchchain.ensemble import transfer_fields
 from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.provenance import Provenance
-from torchchain.ensemble.scene import Scene, describe
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_words import describe
 from torchchain.ensemble.starts import StartTransfer
 from torchchain.ensemble.transfer_data import dataset_of, fields_of
 from torchchain.network import Network

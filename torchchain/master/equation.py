@@ -17,7 +17,8 @@ from torchchain.chain.excitation import Impulse, StandingWave
 from torchchain.energy.bands import center_tones
 from torchchain.energy.start_energy import StartEnergy, excited
 from torchchain.ensemble.printed import Printed
-from torchchain.ensemble.scene import Scene, describe
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_words import describe
 from torchchain.master import file
 from torchchain.master.certificate import certify
 from torchchain.master.compact import CompactModel

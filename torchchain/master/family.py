@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.ensemble.printed import Printed
-from torchchain.ensemble.scene import Scene, describe
+from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_words import describe
 from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import file
