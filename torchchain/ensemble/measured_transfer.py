@@ -66,7 +66,7 @@ def band_transfer(
         checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
         ranks: processes that share the realizations, from :func:`torchchain.ranks.process_group`; each gets the result.
         starts: also measure the transfer from other tones of each band and from kicks, of undamped, linear rings with 16 samples
-            and more: a model calibrated on it takes any start in space. It adds about a third to the cost.
+            and more: a model calibrated on it takes any start in space. It adds about two thirds to the cost.
 
     Returns:
         BandTransfer with mean and stderr [source, time, receiver].

@@ -1,6 +1,6 @@
 """Transfer from other starts than the calibrated tones at rest: other tones of each band, and kicks.
 
-One more run, of half of the realizations at few times: the center and the last tone of every band, released at rest; what a
+One more run, of all realizations at few times: the center and the last tone of every band, released at rest; what a
 kick of the same shape would do follows from the same motion (:mod:`torchchain.energy.kicked`). Everything is rounded well
 below its noise, so that a file of it is small.
 """
@@ -27,7 +27,7 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import merged
 
 FEWEST = 16
-"""Independent samples of a scene from which on other starts are measured: of half of them."""
+"""Independent samples of a scene from which on other starts are measured."""
 TIMES = 24
 """At most so many times above 0, evenly in their logarithm."""
 FIRST = 0.5
@@ -41,7 +41,7 @@ KINDS = ("released", "kicked")
 
 @dataclass(frozen=True, eq=False)
 class StartTransfer:
-    """Share of the energy in each band after starts from single tones, averaged over some of an ensemble's realizations.
+    """Share of the energy in each band after starts from single tones, averaged over an ensemble.
 
     Attributes:
         tones: counted from 1, increasing.
@@ -152,10 +152,10 @@ def start_transfer(
         checkpoint: of this run alone.
         settings: the rest of :func:`torchchain.ensemble.run.ensemble_moments`.
     """
-    half = -(-scene.distinct_realizations // scene.sample_size // 2) * scene.sample_size
+    count = scene.distinct_realizations
     assert isinstance(scene.excitation, StandingWave), "transfers come from standing waves"
     other = replace(
-        scene, realizations=half, times=start_times(scene.times), observables=("band_energy", "kicked_band_energy"),
+        scene, realizations=count, times=start_times(scene.times), observables=("band_energy", "kicked_band_energy"),
         excitation=replace(scene.excitation, tones=start_tones(scene), phase="cos"),  # the sine of tone N/2 is none
     )  # fmt: skip
     moments = ensemble_moments(other, method, 1, options=options, checkpoint=checkpoint, **settings).moments
@@ -163,7 +163,7 @@ def start_transfer(
     for kind, name in zip(KINDS, other.observables, strict=True):
         total = merged(moments.blocks(name))
         found[kind], found[f"{kind}_stderr"] = _rounded(total.mean, ordered_error(scene.is_ordered, total))
-    return StartTransfer(start_tones(scene), other.times, samples=half // scene.sample_size, **found)
+    return StartTransfer(start_tones(scene), other.times, samples=count // scene.sample_size, **found)
 
 
 def _rounded(mean: Tensor, stderr: Tensor) -> tuple[Tensor, Tensor]:

@@ -274,7 +274,8 @@ def _model_tensors(
     if any(prefix + name in names for name in ERROR_AXES):
         expected = expected | ERROR_AXES
     if any(name.startswith(prefix + STARTS) for name in names):
-        expected = expected | {STARTS + name: axes for name, axes in StartModel.AXES.items()}
+        needed = [n for n in StartModel.AXES if n not in StartModel.OPTIONAL or prefix + STARTS + n in names]
+        expected = expected | {STARTS + name: StartModel.AXES[name] for name in needed}
     if names != {prefix + name for name in expected}:
         wanted = ", ".join(sorted(prefix + name for name in expected))
         raise checks.fail(where, f"hold the tensors {wanted}", checks.shown(sorted(names)[:4]))

@@ -38,10 +38,6 @@ STEP = 1e-3
 """Of the derivative by time, relative to the time at which the state is looked at, and in time units at most."""
 TOGETHER = 2**22
 """Pairs of tones times times that are computed at once."""
-FOLLOWED = 0.125
-"""Share of the data's variance, which is much the same at neighboring times, that stays in the smooth functions fitted to them."""
-CONTROL = 0.8
-"""Share of the chance deviation of the released waves of fewer chains from all chains that kicks have too."""
 EVENNESS = 0.5
 """Weight of a source's own error in a fit, rather than of the mean over sources."""
 
@@ -49,7 +45,8 @@ EVENNESS = 0.5
 class StartModel(nn.Module):
     """T of waves released at rest and of kicked ones, for every tone of a ring and every time t >= 0.
 
-    Both are never negative, and add up to 1 over the bands. Computed in double precision.
+    Both are never negative. T adds up to 1 over the bands, T' to 1 less the small share that is at k = 0, which
+    :meth:`lost` tells. Computed in double precision.
 
     Args:
         degrees: of the polynomials in place, distance and time, (3,).
@@ -59,16 +56,18 @@ class StartModel(nn.Module):
         n_bands: B.
         scale_times, scale: errors of T and T' over those of the bands' own model, in the source's own band and in others,
             at some times, (start_time,) and (kind, part, start_time); no times if unknown.
+        rigid, onset: as of :class:`torchchain.master.tones.Tones`; 0 in files that do not know them.
     """
 
     AXES: ClassVar[dict[str, tuple[str, ...]]] = {
         "degrees": ("degree",), "released": ("term",), "kicked": ("term",), "frequency": ("start_tone",), "decay": ("start_tone",),
-        "coupling": (), "scale_times": ("start_time",), "scale": ("kind", "part", "start_time"),
+        "coupling": (), "scale_times": ("start_time",), "scale": ("kind", "part", "start_time"), "rigid": (), "onset": (),
     }  # fmt: skip
+    OPTIONAL: ClassVar[tuple[str, ...]] = ("rigid", "onset")
 
     def __init__(
         self, degrees: Tensor, released: Tensor, kicked: Tensor, frequency: Tensor, decay: Tensor, coupling: Tensor,
-        scale_times: Tensor, scale: Tensor, n_bands: int,
+        scale_times: Tensor, scale: Tensor, n_bands: int, rigid: Tensor | None = None, onset: Tensor | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         degrees = checks.real_tensor("starts.degrees", degrees)
@@ -78,6 +77,7 @@ class StartModel(nn.Module):
             "released": (released, (size,)), "kicked": (kicked, (size,)), "frequency": (frequency, (count,)),
             "decay": (decay, (count,)), "coupling": (coupling, ()), "scale_times": (scale_times, (len(scale_times),)),
             "scale": (scale, (2, 2, len(scale_times))),
+            **{name: (coupling.new_zeros(()) if x is None else x, ()) for name, x in (("rigid", rigid), ("onset", onset))},
         }  # fmt: skip
         for name, (value, shape) in shapes.items():
             value = checks.real_tensor(f"starts.{name}", value).double()
@@ -85,6 +85,8 @@ class StartModel(nn.Module):
                 raise checks.fail(f"starts.{name}", f"have shape {shape}", f"shape {tuple(value.shape)}")
             if name in ("frequency", "decay", "coupling"):
                 checks.first_bad(f"starts.{name}", "be positive", value, ~(value > 0), "tone")
+            if name in self.OPTIONAL and not (0 <= float(value) and (name == "onset" or float(value) <= 0.25)):
+                raise checks.fail(f"starts.{name}", "be a share of the energy", float(value))
             self.register_buffer(name, value.detach().clone())
         self.released: Tensor
         self.kicked: Tensor
@@ -119,7 +121,8 @@ class StartModel(nn.Module):
     @property
     def _tones(self) -> Tones:
         return Tones(
-            **{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling")}, n_bands=self.n_bands
+            **{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling", *self.OPTIONAL)},
+            n_bands=self.n_bands,
         )
 
     def transfer(self, kind: str, tones: Any, times: Tensor) -> Tensor:
@@ -204,18 +207,17 @@ def can_fit(transfer: BandTransfer) -> bool:
 
 
 def fit_starts(transfer: BandTransfer) -> StartModel:
-    """The model of a transfer's starts; half of a second for 32 bands.
+    """The model of a transfer's starts; a second for 32 bands.
 
-    Waves released at rest also see the calibrated tones of the whole ensemble; by what they are then off on the chains that
-    were kicked, the kicks are put right as well (a control variate). Where its long-time average is known both
-    kinds are held to it: what kicks then differ by is taken from the last time.
+    Waves released at rest also see the calibrated tones of the ensemble at all of its times. Where its long-time average
+    is known both kinds are held to it: what kicks then differ by is taken from the last time.
     """
     scene, starts = transfer.scene, transfer.starts
     assert scene is not None, "can_fit has said so"
     assert starts is not None, "and so"
     other = scene.stiffness_disorder
     strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
-    tones = Tones.of(scene.n_particles, scene.n_bands, strength)
+    tones = Tones.of(scene.n_particles, scene.n_bands, strength, scene.disorder.strength)
     degrees = (*DEGREES[:2], max(2, min(DEGREES[2], (len(starts.times) - 1) // 2)))
     numbers, own = (torch.tensor(found) - 1 for found in (starts.tones, scene.tones))
     later = starts.times > 0
@@ -226,13 +228,10 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
     coefficients: dict[str, Tensor] = {}
     with single_blas_thread():
         for kind in KINDS:
-            mean, stderr = getattr(starts, kind)[:, later], getattr(starts, f"{kind}_stderr")[:, later]
+            mean, stderr = _in_bands(getattr(starts, kind))[:, later], getattr(starts, f"{kind}_stderr")[:, later]
             told = [(numbers, starts.times[later], mean, stderr)]
             if kind == KINDS[0] and len(picked):
                 told = [(numbers[~center], starts.times[later], mean[~center], stderr[~center]), (own, *whole)]
-            if kind == KINDS[1]:
-                fitted = shares(tones, KINDS[0], degrees, coefficients[KINDS[0]], numbers, starts.times[later])
-                told[0] = (numbers, starts.times[later], mean + CONTROL * (fitted - starts.released[:, later]), stderr)
             if late is not None:
                 end, error = late.double(), whole[2][:, -1:]
                 if kind == KINDS[1]:
@@ -246,14 +245,19 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
                 for which, times, data, error in told
                 if len(which)
             ]
-            first = coefficients.get(KINDS[0])  # kicks from the coefficients of waves released at rest
-            found, _ = solve(problems, np.ones((len(problems), 1)), None if first is None else first.numpy()[None])
+            found, _ = solve(problems, np.ones((len(problems), 1)))
             coefficients[kind] = torch.from_numpy(found[0])
     none = torch.zeros(0, dtype=torch.float64)
     return StartModel(
         torch.tensor(degrees, dtype=torch.float64), **coefficients, frequency=tones.frequency, decay=tones.decay,
-        coupling=tones.coupling, scale_times=none, scale=none.expand(2, 2, 0), n_bands=scene.n_bands,
+        coupling=tones.coupling, scale_times=none, scale=none.expand(2, 2, 0), n_bands=scene.n_bands, rigid=tones.rigid,
+        onset=tones.onset,
     )  # fmt: skip
+
+
+def _in_bands(mean: Tensor) -> Tensor:
+    """Shares of the energy that is in a band, whatever a kick has left at k = 0."""
+    return mean / mean.sum(-1, keepdim=True)
 
 
 def _weights(stderr: Tensor) -> Tensor:
@@ -267,24 +271,25 @@ def _weights(stderr: Tensor) -> Tensor:
 def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertainty) -> StartModel:
     """The model with its errors, as factors to those of the bands' own model.
 
-    They hold what the model misses its data by beyond their noise, and the share of that noise that the fit has followed.
+    What chance does to a fit of the same form to as many chains is the error of the bands' own model, told by its
+    bootstrap; fewer chains have more of it. What the model misses its data by beyond their noise comes on top.
     """
     starts, scene = transfer.starts, transfer.scene
     assert starts is not None, "the model was fitted to them"
     assert scene is not None, "and of these chains"
     times, n = starts.times[1:], scene.n_bands
     base = uncertainty.of(torch.eye(n, dtype=torch.float64), times).square()
+    fewer = scene.distinct_realizations / scene.sample_size / starts.samples
     numbers, own = torch.tensor(starts.tones) - 1, torch.eye(n, dtype=torch.bool)[:, None].expand_as(base)
     center = torch.isin(numbers, torch.tensor(scene.tones) - 1)
     sets = [center, ~center] if bool((~center).any()) else [center]
     rows = torch.ones(len(KINDS), 2, len(times), dtype=torch.float64)
     for row, kind in zip(rows, KINDS, strict=True):
-        error = torch.zeros_like(base)
+        error = base * fewer
         for one in sets:
             found = model.transfer(kind, (numbers[one] + 1).tolist(), times)
             mean, stderr = (getattr(starts, name)[one, 1:] for name in (kind, f"{kind}_stderr"))
-            followed = math.sqrt(FOLLOWED) * stderr
-            error += (followed.square() + model_error(found, mean, stderr, followed).square()) / len(sets)
+            error = error + model_error(found, mean, stderr, base.sqrt()).square() / len(sets)
         for part, factor in zip((own, ~own), row, strict=True):
             here, there = ((x * part).sum((0, 2)) for x in (error, base))
             factor.copy_((here / there.clamp(min=1e-30)).sqrt())
