@@ -76,9 +76,14 @@ def _predict(
     }
     outputs.write(out, files)
     print(f"{len(labels)} starts, {len(times)} times to {float(times[-1]):g}, solved by {flags.method}")
-    print(f"largest change of total energy: {float((energy.sum(-1) - starts.bands.sum(-1)[:, None]).abs().max()):.3g}")
+    gone = starts.gone(master, times)
+    print(
+        f"largest change of total energy: {float((energy.sum(-1) + gone - starts.bands.sum(-1)[:, None]).abs().max()):.3g}"
+    )
     if bool(starts.rest.any()):
         print(f"energy at k = 0, which stays there and is in no band: {float(starts.rest.max()):.3g}")
+    if bool(gone.any()):
+        print(f"energy that goes there from kicks: up to {float(gone.max()):.3g}")
     print(f"lowest energy in a band: {float(energy.min()):.3g}")
     if "band_energy_stderr" in data:
         print(f"largest standard error: {float(data.band_energy_stderr.max()):.3g}")
@@ -115,6 +120,12 @@ class Starts:
             return cls(given, given.bands(n_bands), given.rigid)
         return cls(given, given, torch.zeros(len(given)))
 
+    def gone(self, master: MasterEquation, times: torch.Tensor) -> torch.Tensor:
+        """Energy that goes to k = 0, (start, time)."""
+        if master.starts is None or not isinstance(self.given, StartEnergy):
+            return torch.zeros(len(self.bands), len(times))
+        return master.starts.lost(self.given, times).cpu()
+
 
 def _starts(given: Mapping[str, Any], master: MasterEquation) -> tuple[Starts, list[str], dict[str, Any]]:
     """What is solved for, the names of the starts, and what was asked for."""
@@ -137,9 +148,7 @@ def _starts(given: Mapping[str, Any], master: MasterEquation) -> tuple[Starts, l
     return Starts.of(starts, n_bands), [str(s) for s in bands], {"source": bands}
 
 
-def _in_space(
-    field: str, table: Any, master: MasterEquation
-) -> tuple[StartEnergy, list[str], dict[str, Any]]:
+def _in_space(field: str, table: Any, master: MasterEquation) -> tuple[StartEnergy, list[str], dict[str, Any]]:
     """A start from an excitation, or from displacement and velocity of every particle, of energy 1."""
     if not isinstance(table, Mapping):
         raise checks.FieldTypeError(f"{field} must be a table, got {checks.shown(table)}")
@@ -156,7 +165,9 @@ def _in_space(
         told = {name: checks.real_tensor(f"{field}.{name}", values).double() for name, values in table.items()}
         for name, values in told.items():
             if tuple(values.shape) != (count,):
-                raise checks.fail(f"{field}.{name}", f"hold the {count} particles of the model", f"shape {tuple(values.shape)}")
+                raise checks.fail(
+                    f"{field}.{name}", f"hold the {count} particles of the model", f"shape {tuple(values.shape)}"
+                )
         if not told:
             raise checks.fail(field, "hold displacement, velocity or both", "neither")
         none = torch.zeros(count, dtype=torch.float64)

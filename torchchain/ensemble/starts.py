@@ -78,7 +78,9 @@ class StartTransfer:
                 rule = f"have the axes [tone, time, receiver] of {len(tones)} tones and {len(self.times)} times"
                 raise checks.fail(f"starts.{name}", rule, f"shape {tuple(value.shape)}")
             if value.shape != self.released.shape:
-                raise checks.fail(f"starts.{name}", f"have shape {tuple(self.released.shape)}", f"shape {tuple(value.shape)}")
+                raise checks.fail(
+                    f"starts.{name}", f"have shape {tuple(self.released.shape)}", f"shape {tuple(value.shape)}"
+                )
             if name.endswith("stderr"):
                 checks.first_bad(f"starts.{name}", "not be negative", value, value < 0, "band")
 
@@ -113,7 +115,9 @@ class StartTransfer:
 
         tones = tuple(checks.integer("data.start_tone", tone, 1) for tone in np.atleast_1d(data["start_tone"].values))
         names = ("released", "released_stderr", "kicked", "kicked_stderr")
-        samples = checks.integer("data.start_samples", data["start_samples"].values.tolist() if "start_samples" in data else 0, 1)
+        samples = checks.integer(
+            "data.start_samples", data["start_samples"].values.tolist() if "start_samples" in data else 0, 1
+        )
         return cls(tones, tensor("start_time"), samples=samples, **{name: tensor(name) for name in names})
 
 
@@ -129,14 +133,22 @@ def start_times(times: Tensor) -> Tensor:
     if not len(later):
         return times[:1]
     first, last = min(FIRST, float(later[0])), float(later[-1])
-    found = torch.logspace(math.log10(first), math.log10(last), TIMES, dtype=times.dtype) if last > first else later[-1:]
+    found = (
+        torch.logspace(math.log10(first), math.log10(last), TIMES, dtype=times.dtype) if last > first else later[-1:]
+    )
     found[-1] = last  # not a rounding beyond
     return torch.cat([times.new_zeros(1), found])
 
 
 def measurable(scene: Scene) -> bool:
     """Whether other starts of a scene are measured: of undamped, linear rings, in which the energy is quadratic, of enough samples."""
-    linear = scene.lattice is None and not scene.species and scene.contact == "linear" and scene.damping == 0 and scene.boundary == "periodic"
+    linear = (
+        scene.lattice is None
+        and not scene.species
+        and scene.contact == "linear"
+        and scene.damping == 0
+        and scene.boundary == "periodic"
+    )
     linear = linear and scene.energy_definition == "site"  # by bonds a kick has spread over wavenumbers at once
     return linear and scene.distinct_realizations // scene.sample_size >= FEWEST
 

@@ -38,6 +38,9 @@ STEP = 1e-3
 """Of the derivative by time, relative to the time at which the state is looked at, and in time units at most."""
 TOGETHER = 2**22
 """Pairs of tones times times that are computed at once."""
+FOLLOWED = (0.37, 0.16)
+"""Share of the data's variance that a fit follows, in the source's own band and in others: by how much, squared, the models of
+two ensembles differ (seeds 0 and 1 of `experiments/any_start.py`, no other chains)."""
 EVENNESS = 0.5
 """Weight of a source's own error in a fit, rather than of the mean over sources."""
 
@@ -151,6 +154,17 @@ class StartModel(nn.Module):
         for values, transfer in self._parts(start, times):
             energy = energy + torch.einsum("...s,str->...tr", values, transfer)
         return energy
+
+    def lost(self, start: StartEnergy, times: Tensor) -> Tensor:
+        """Energy (*batch, time) that has gone to k = 0 and is in no band; with it and ``start.rigid`` energy is conserved."""
+        self.check(start)
+        times = times.to(self.released)
+        every = torch.arange(start.kinetic.shape[-1], device=times.device)
+        step = STEP * (1 + times).clamp(max=10.0)
+        before = (times - step).clamp(min=0)
+        slope = (self._tones.lost(every, times + step) - self._tones.lost(every, before)) / (times + step - before)
+        gone = start.kinetic.to(times) @ self._tones.lost(every, times)
+        return gone + start.virial.to(times) @ slope
 
     def _parts(self, start: StartEnergy, times: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Energies of tones that start with some, and what becomes of a unit of each."""
@@ -271,25 +285,25 @@ def _weights(stderr: Tensor) -> Tensor:
 def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertainty) -> StartModel:
     """The model with its errors, as factors to those of the bands' own model.
 
-    What chance does to a fit of the same form to as many chains is the error of the bands' own model, told by its
-    bootstrap; fewer chains have more of it. What the model misses its data by beyond their noise comes on top.
+    They hold what the model misses its data by beyond their noise, and the share of that noise that the fit has followed.
     """
     starts, scene = transfer.starts, transfer.scene
     assert starts is not None, "the model was fitted to them"
     assert scene is not None, "and of these chains"
     times, n = starts.times[1:], scene.n_bands
     base = uncertainty.of(torch.eye(n, dtype=torch.float64), times).square()
-    fewer = scene.distinct_realizations / scene.sample_size / starts.samples
     numbers, own = torch.tensor(starts.tones) - 1, torch.eye(n, dtype=torch.bool)[:, None].expand_as(base)
     center = torch.isin(numbers, torch.tensor(scene.tones) - 1)
     sets = [center, ~center] if bool((~center).any()) else [center]
     rows = torch.ones(len(KINDS), 2, len(times), dtype=torch.float64)
+    share = torch.where(own, *FOLLOWED).sqrt()
     for row, kind in zip(rows, KINDS, strict=True):
-        error = base * fewer
+        error = torch.zeros_like(base)
         for one in sets:
             found = model.transfer(kind, (numbers[one] + 1).tolist(), times)
             mean, stderr = (getattr(starts, name)[one, 1:] for name in (kind, f"{kind}_stderr"))
-            error = error + model_error(found, mean, stderr, base.sqrt()).square() / len(sets)
+            followed = share * stderr
+            error += (followed.square() + model_error(found, mean, stderr, followed).square()) / len(sets)
         for part, factor in zip((own, ~own), row, strict=True):
             here, there = ((x * part).sum((0, 2)) for x in (error, base))
             factor.copy_((here / there.clamp(min=1e-30)).sqrt())
