@@ -88,7 +88,7 @@ class StartModel(nn.Module):
                 raise checks.fail(f"starts.{name}", f"have shape {shape}", f"shape {tuple(value.shape)}")
             if name in ("frequency", "decay", "coupling"):
                 checks.first_bad(f"starts.{name}", "be positive", value, ~(value > 0), "tone")
-            if name in self.OPTIONAL and not (0 <= float(value) and (name == "onset" or float(value) <= 0.25)):
+            if name in self.OPTIONAL and not (float(value) >= 0 and (name == "onset" or float(value) <= 0.25)):
                 raise checks.fail(f"starts.{name}", "be a share of the energy", float(value))
             self.register_buffer(name, value.detach().clone())
         self.released: Tensor
