@@ -815,7 +815,7 @@ def test_no_velocities(motion, file):
 
 
 def test_the_manual_runs():
-    module = importlib.import_module("torchchain.frames.reading")
+    module = importlib.import_module("torchchain.frames.files")
     done = doctest.testmod(module, extraglobs={"tc": tc})
     assert done.attempted >= 8
     assert done.failed == 0

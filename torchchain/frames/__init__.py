@@ -1,8 +1,9 @@
 """Trajectories of other codes: LAMMPS, LIGGGHTS, MercuryDPM, extended XYZ."""
 
 from torchchain.frames.doubts import check_energy, check_opening
+from torchchain.frames.files import convert, read_frames
 from torchchain.frames.formats import FORMATS
-from torchchain.frames.reading import Frames, convert, read_frames
+from torchchain.frames.reading import Frames
 from torchchain.frames.record import Box, Contacts, Frame, FramesWarning
 from torchchain.frames.registry import Format
 from torchchain.frames.units import ContactUnits

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -135,7 +136,26 @@ def fit_units(name: str, frame: Frame, law: str) -> ContactUnits:
     return ContactUnits(float(masses.mean()), float(stiffness.mean()), float(frame.contacts.overlap.mean()))
 
 
-def scaled_contacts(contacts: Contacts | None, length: float, force: float) -> Contacts | None:
+def scaled_frame(frame: Frame, units: Any) -> Frame:
+    """The frame in other units, anything with ``unit(quantity)``."""
+    length, time, mass, force = (float(units.unit(name)) for name in ("length", "time", "mass", "force"))
+    box = frame.box
+    if box is not None:
+        lower, upper = ([bound / length for bound in bounds] for bounds in (box.lower, box.upper))
+        box = Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]), box.periodic)
+    return replace(
+        frame,
+        time=None if frame.time is None else frame.time / time,
+        positions=frame.positions / length,
+        velocities=None if frame.velocities is None else frame.velocities * (time / length),
+        masses=None if frame.masses is None else frame.masses / mass,
+        radii=None if frame.radii is None else frame.radii / length,
+        box=box,
+        contacts=_scaled_contacts(frame.contacts, length, force),
+    )
+
+
+def _scaled_contacts(contacts: Contacts | None, length: float, force: float) -> Contacts | None:
     """Overlaps and forces in other units."""
     if contacts is None:
         return None
