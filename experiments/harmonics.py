@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from dataclasses import dataclass
 
 import harness
@@ -103,14 +104,17 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     data["coupling_total_stderr"] = ("amplitude",), np.array([float(f.total_stderr) for f in found.values()])
     data["triads"] = ("triad", "wave"), model.triads.numpy() + 1
     slow = torch.linspace(0, 8, 33, dtype=torch.float64)
+    spent = []
     for i, a in enumerate(config.tests):
-        test = measure_mixing(
-            scene(config, config.seed + 1 + 10 * i), a, bands, starts=shares(config), times=slow / a**2
-        )
+        own, began = scene(config, config.seed + 1 + 10 * i), time.process_time()
+        test = measure_mixing(own, a, bands, starts=shares(config), times=slow / a**2)
+        half = time.process_time()
         predicted = model.solve(test.mean[:, 0], test.times).detach()
+        spent.append((half - began) / (time.process_time() - half))
         for name, values in (("chains", test.mean), ("chains_stderr", test.stderr), ("triads_energy", predicted)):
             data[f"{name}_{i}"] = ("start", "slow_time", "band"), (values / a**2).numpy()
         data[f"opened_{i}"] = ("start",), test.opened.numpy()
+    data["cost_ratio"] = ("test",), np.array(spent)
     one = torch.zeros(1, config.n_bands, dtype=torch.float64)
     one[0, config.n_bands // 3] = 1
     late = torch.linspace(0, config.slow_stop, 97, dtype=torch.float64)
@@ -320,10 +324,14 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
                     note=f"linear model {linear[j]:.3f}, {linear[j] / triads[j]:.1f} times as far; opened contacts {float(data[f'opened_{i}'][j]):.2g}",
                 )
             )
+    for a, ratio in zip(config.tests, data.cost_ratio.values, strict=True):
+        rows.append(Row(f"processor time of Hertz chains over that of triads, elongation {a:g}", float(ratio)))
     for name, errors in zip(("linear contacts", "triads"), ladder(data, config), strict=True):
         place = edge(np.array(config.tests), errors, config.allowed)
         if math.isfinite(place):
-            rows.append(Row(f"elongation at which {name} are {config.allowed:g} off by t = {config.ladder_time:g}", place))
+            rows.append(
+                Row(f"elongation at which {name} are {config.allowed:g} off by t = {config.ladder_time:g}", place)
+            )
     slope, error = exponents(data)
     rows.append(Row("exponent of the time to equipartition in the elongation", slope, error, note="three waves: -2"))
     return rows
