@@ -8,6 +8,7 @@ import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
+import gradient_cases
 import harness
 import numpy as np
 import torch
@@ -60,6 +61,9 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     entries = [_judge(config, candidate, own, fresh, ensemble_seconds) for candidate in candidates(config)]
     noise = float(tc.total_variation(own.mean, fresh.mean)[:, later].mean())
     data = xarray.Dataset({name: ("fit", np.array([entry[name] for entry in entries])) for name in entries[0]})
+    cases = gradient_cases.found(config, own, fresh, config.adam_steps < 100)
+    for name in ("case", "tool", "seconds", "error"):
+        data[f"gradient_{name}"] = "gradient_fit", np.array([getattr(case, name) for case in cases])
     return data.assign_attrs(noise=noise, ensemble_seconds=ensemble_seconds)
 
 
@@ -100,9 +104,10 @@ def _judge(
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(1, 2, width=6.4, height=5.2)
+    figure, axes = harness.panels(1, 3, width=6.4, height=5.2)
     _errors(axes[0, 0], data)
     _costs(axes[0, 1], data)
+    _gradients(axes[0, 2], data)
     figure.suptitle(f"$\\xi$ = {config.strength:g}, {config.realizations} chains, 0 < $t$ ≤ {config.stop:g}")
     return figure
 
@@ -147,6 +152,32 @@ def _costs(ax: Axes, data: xarray.Dataset) -> None:
         label("{x:g}")
 
 
+def _gradients(ax: Axes, data: xarray.Dataset) -> None:
+    """Every tool of every case: what it costs and how near it comes."""
+    tools = dict(zip(dict.fromkeys(data.gradient_tool.values), "xo^sD*", strict=False))
+    cases = {case: f"C{i}" for i, case in enumerate(dict.fromkeys(data.gradient_case.values))}
+    best = data.fresh.values / data.noise
+    for label, case, marker in (("adam, exact", "constant rates", "o"), ("logistic", "no rates: odds", "*"), ("linear", "constant rates", "D")):
+        part = np.flatnonzero(data.method.values == label)
+        if len(part):
+            i = part[best[part].argmin()]
+            color = cases.setdefault(case, f"C{len(cases)}")
+            ax.plot(max(float(data.seconds[i]), 1e-3), best[i], marker, color=color, markersize=9 if marker == "*" else 6)
+    for case, tool, seconds, error in zip(
+        data.gradient_case.values, data.gradient_tool.values, data.gradient_seconds.values, data.gradient_error.values, strict=True
+    ):
+        ax.plot(max(seconds, 1e-3), error, tools[tool], color=cases[case], markersize=6)
+    ax.axhline(1, color="k", linestyle=":")
+    handles = [ax.plot([], [], color=color, linewidth=5, label=case)[0] for case, color in cases.items()]
+    handles += [ax.plot([], [], marker, color="0.4", linestyle="none", label=tool)[0] for tool, marker in tools.items()]
+    handles.append(ax.plot([], [], "*", color="0.4", linestyle="none", label="logistic regression")[0])
+    ax.legend(handles=handles, fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
+    ax.set(xlabel="seconds of the fit", ylabel="total variation from fresh chains / that of two ensembles", xscale="log", yscale="log",
+           title="(c) with gradients through the solver, and without")  # fmt: skip
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("{x:g}")
+
+
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:
     rows = []
     for i, name in enumerate(_names(data)):
@@ -157,7 +188,12 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
             f"lowest energy {float(fit.lowest_energy):.0e}, cost {float(fit.cost):.0e}"
         )
         rows.append(Row(name, float(fit.fresh), float(fit.fresh_stderr), note=note))
-    return [*rows, Row("two ensembles of chains", float(data.noise))]
+    rows.append(Row("two ensembles of chains", float(data.noise)))
+    for i in range(data.sizes["gradient_fit"]):
+        fit = data.isel(gradient_fit=i)
+        note = f"over that of two ensembles; {float(fit.gradient_seconds):.2g} s of processor time"
+        rows.append(Row(f"{fit.gradient_case.item()}: {fit.gradient_tool.item()}", float(fit.gradient_error), note=note))
+    return rows
 
 
 def _names(data: xarray.Dataset) -> list[str]:
@@ -176,6 +212,12 @@ def explain(data: xarray.Dataset, config: Config) -> str:
         "What stays behind matters more than how Q is fitted. Best of every model: "
         + ", ".join(f"{model} {float(part.min()):.4f}" for model, part in data.fresh.groupby(data.model))
         + f";\nwith Eq. 50 for Q: {_analytic(data)}.",
+    ]
+    lines += [
+        "Where gradients are the right tool: rates that depend on amplitude, from bands of wavenumber at two times. Couplings show only in where trajectories end; without "
+        "the modes of\nevery chain no equation is linear in them, and differences need a solution for each coupling. L-BFGS by the same gradients comes as near as Adam.",
+        "Where they are not: with the modes known the equations are linear in the couplings; constant rates, and rates in time, need thousands of numbers and stay behind "
+        "odds that\nlogistic regression fits.",
     ]
     if growing:
         lines.append(

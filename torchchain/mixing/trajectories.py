@@ -84,10 +84,14 @@ class TrajectoryLoss:
         self.model = NonlinearMasterEquation.of(linear, triads)
         self.moved, self.rtol = linear.transfer(self.times).detach().double(), rtol
 
+    def residual(self) -> Tensor:
+        """What the model's couplings miss, in units of the error, (start, later time, band)."""
+        found = self.model.joined(self.start, self.moved, self.times, 1.0, rtol=self.rtol)[:, 1:] / self.total
+        return (found - self.measured) * self.weight
+
     def __call__(self) -> Tensor:
         """The loss of the model's couplings."""
-        found = self.model.joined(self.start, self.moved, self.times, 1.0, rtol=self.rtol)[:, 1:] / self.total
-        return ((found - self.measured) * self.weight).square().mean()
+        return self.residual().square().mean()
 
     @torch.no_grad()
     def scale(self) -> float:
