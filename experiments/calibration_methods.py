@@ -104,10 +104,13 @@ def _judge(
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(1, 3, width=6.4, height=5.2)
+    figure, axes = harness.panels(2, 2, width=6.4, height=5.2)
     _errors(axes[0, 0], data)
     _costs(axes[0, 1], data)
-    _gradients(axes[0, 2], data)
+    lower = axes[1, 0].get_gridspec()[1, :]
+    for ax in axes[1]:
+        ax.remove()
+    _gradients(figure.add_subplot(lower), data)
     figure.suptitle(f"$\\xi$ = {config.strength:g}, {config.realizations} chains, 0 < $t$ ≤ {config.stop:g}")
     return figure
 
@@ -154,26 +157,27 @@ def _costs(ax: Axes, data: xarray.Dataset) -> None:
 
 def _gradients(ax: Axes, data: xarray.Dataset) -> None:
     """Every tool of every case: what it costs and how near it comes."""
-    tools = dict(zip(dict.fromkeys(data.gradient_tool.values), "xo^sD*", strict=False))
-    cases = {case: f"C{i}" for i, case in enumerate(dict.fromkeys(data.gradient_case.values))}
-    best = data.fresh.values / data.noise
-    for label, case, marker in (("adam, exact", "constant rates", "o"), ("logistic", "no rates: odds", "*"), ("linear", "constant rates", "D")):
-        part = np.flatnonzero(data.method.values == label)
-        if len(part):
-            i = part[best[part].argmin()]
-            color = cases.setdefault(case, f"C{len(cases)}")
-            ax.plot(max(float(data.seconds[i]), 1e-3), best[i], marker, color=color, markersize=9 if marker == "*" else 6)
-    for case, tool, seconds, error in zip(
-        data.gradient_case.values, data.gradient_tool.values, data.gradient_seconds.values, data.gradient_error.values, strict=True
-    ):
-        ax.plot(max(seconds, 1e-3), error, tools[tool], color=cases[case], markersize=6)
+    tools = dict(zip(dict.fromkeys(data.gradient_tool.values), "xo^sDP", strict=False)) | {"logistic regression": "*"}
+    points = list(zip(*(data[f"gradient_{name}"].values for name in ("case", "tool", "seconds", "error")), strict=True))
+    for label, case, tool in (
+        ("linear", "constant rates", "linear least squares"), ("adam, exact", "constant rates", "Adam"),
+        ("logistic", "odds, no rates", "logistic regression"),
+    ):  # fmt: skip
+        part = data.isel(fit=np.flatnonzero(data.method.values == label))
+        best = part.isel(fit=int(part.fresh.argmin()))
+        points.append((case, tool, float(best.seconds), float(best.fresh) / data.noise))
+    cases = list(dict.fromkeys(point[0] for point in points))
+    for case, tool, seconds, error in points:
+        place, number = (max(seconds, 1e-3), error), cases.index(case)
+        ax.plot(*place, tools[tool], color=f"C{number}", markersize=7)
+        ax.annotate(f"{number + 1}", place, xytext=(5, 4), textcoords="offset points", fontsize="small")
     ax.axhline(1, color="k", linestyle=":")
-    handles = [ax.plot([], [], color=color, linewidth=5, label=case)[0] for case, color in cases.items()]
-    handles += [ax.plot([], [], marker, color="0.4", linestyle="none", label=tool)[0] for tool, marker in tools.items()]
-    handles.append(ax.plot([], [], "*", color="0.4", linestyle="none", label="logistic regression")[0])
+    handles = [ax.plot([], [], color=f"C{i}", linewidth=5, label=f"{i + 1}: {case}")[0] for i, case in enumerate(cases)]
+    handles += [
+        ax.plot([], [], marker, color="0.4", linestyle="none", label=tool)[0] for tool, marker in tools.items()
+    ]
     ax.legend(handles=handles, fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
-    ax.set(xlabel="seconds of the fit", ylabel="total variation from fresh chains / that of two ensembles", xscale="log", yscale="log",
-           title="(c) with gradients through the solver, and without")  # fmt: skip
+    ax.set(xlabel="seconds of the fit", ylabel="error / that of two ensembles", xscale="log", yscale="log", title="(c) gradients")
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("{x:g}")
 

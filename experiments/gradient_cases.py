@@ -121,14 +121,11 @@ def rates_by_amplitude(
     n_particles: int, n_bands: int, realizations: int, seed: int, strength: float, steps: int
 ) -> Iterator[Found]:
     """Couplings of triads from bands of wavenumber at two times, scored at twice the amplitude of the weaker data."""
-    kind = {
-        "n_particles": n_particles,
-        "n_bands": n_bands,
-        "realizations": realizations,
-        "disorder": tc.Disorder(strength=strength),
-    }
     early, late = torch.arange(0, 5, 0.25, dtype=torch.float64), torch.arange(5, 201, 2.5, dtype=torch.float64)
-    scene = tc.Scene(**kind, seed=seed, times=torch.cat([early, late]))
+    scene = tc.Scene(
+        n_particles=n_particles, n_bands=n_bands, realizations=realizations, disorder=tc.Disorder(strength=strength),
+        seed=seed, times=torch.cat([early, late]),
+    )  # fmt: skip
     linear = tc.calibrate(tc.band_transfer(scene, starts=False), bootstrap=0)
     fresh = Hertz.of(replace(scene, seed=seed + 1), 0.2, torch.linspace(0, 200, 41, dtype=torch.float64))
     told = [Hertz.of(scene, amplitude, torch.tensor([0.0, 200.0], dtype=torch.float64)) for amplitude in (0.1, 0.15)]
@@ -165,7 +162,7 @@ def rates_by_amplitude(
         unit = loss.scale()
         placed(search(np.ones(len(coupling))))
         yield Found(name, tool, time.process_time() - began, fresh.error(loss.model))
-    modes = replace(scene, realizations=min(24, realizations), seed=seed + 2, times=scene.times)
+    modes = replace(scene, realizations=min(24, realizations), seed=seed + 2)
     measured = mixing.measure_mixing(modes, 0.1, bands)
     began = time.process_time()
     fit = mixing.fit_triads(measured, bootstrap=0)
