@@ -18,10 +18,13 @@ from torch import Tensor
 import torchchain as tc
 from torchchain.energy.bands import center_tones
 from torchchain.theory import MEASURED, Return, law_of
+from torchchain.theory.crossed import LAST, crossed_transfer, fading
 from torchchain.theory.ladder import Waves, ladder_transfer, spectrum_edges
-from torchchain.theory.localized import Frequencies, interference, onset, source_frequencies
+from torchchain.theory.localized import Frequencies, first_part, interference, onset, source_frequencies
+from torchchain.theory.transfer import added
 
-NAMES = ("narrowing", "onset", "delay", "power")
+NAMES = ("narrowing", "onset", "delay", "power", "first")
+EARLY = 8.0  # times up to here weigh as much as all together
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,7 @@ class Disordered:
     spectra: list[Frequencies]
     times: Tensor
     ladder: Tensor
+    crossed: Tensor
     bare: Tensor
     mean: Tensor
     long_time: Tensor
@@ -67,7 +71,11 @@ class Disordered:
         return float((self.bare + final - self.long_time).abs().sum(-1).mean()) / 2
 
     def error(self, patterns: list[Tensor], numbers: Return) -> Tensor:
-        change = [onset(self.times, s, numbers).T @ p.T for s, p in zip(self.spectra, patterns, strict=True)]
+        fade, change = fading(self.times), []
+        for s, (spectrum, pattern) in enumerate(zip(self.spectra, patterns, strict=True)):
+            late = onset(self.times, spectrum, numbers).T @ pattern.T
+            part = first_part(self.times, spectrum, numbers) * fade
+            change.append(added(self.ladder[s], self.crossed[s], late, part, numbers))
         return (self.ladder + torch.stack(change) - self.mean).abs().sum(-1).mean(0) / 2
 
 
@@ -82,8 +90,10 @@ def prepared(config: Config, xi: float, device: str) -> Disordered:
     spectra = source_frequencies(law, waves, edges[0])
     bare = torch.stack([(s.receivers @ s.energy).reshape(config.n_bands, -1).sum(-1) for s in spectra])
     ladder = ladder_transfer(law, waves, t, edges)
+    crossed = torch.zeros_like(ladder)
+    crossed[:, t <= LAST] = crossed_transfer(law, waves, t[t <= LAST], edges[0])
     assert chains.long_time is not None
-    return Disordered(waves, k.tolist(), spectra, t, ladder, bare, chains.mean, chains.long_time)
+    return Disordered(waves, k.tolist(), spectra, t, ladder, crossed, bare, chains.mean, chains.long_time)
 
 
 def measure(config: Config, device: str) -> xarray.Dataset:
@@ -100,12 +110,14 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     def misfit(values: np.ndarray) -> float:
         if values.min() <= 0:
             return 1.0
-        trial = Return(numbers.narrowing, *map(float, values))
-        return sum(float(case.error(part, trial).mean()) for case, part in zip(cases, patterns, strict=True))
+        trial = replace(numbers, **dict(zip(NAMES[1:], map(float, values), strict=True)))
+        errors = [case.error(part, trial) for case, part in zip(cases, patterns, strict=True)]
+        early = cases[0].times <= EARLY
+        return sum(float(error.mean() + error[early].mean()) for error in errors)
 
-    start = [MEASURED.onset, MEASURED.delay, MEASURED.power]
+    start = [getattr(MEASURED, name) for name in NAMES[1:]]
     best = minimize(misfit, start, method="Nelder-Mead", options={"maxfev": config.evaluations, "xatol": 0.01}).x
-    fitted = Return(numbers.narrowing, *map(float, best))
+    fitted = replace(numbers, **dict(zip(NAMES[1:], map(float, best), strict=True)))
     came, x = _growth(cases, patterns)
     return xarray.Dataset(
         {

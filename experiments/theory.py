@@ -14,6 +14,7 @@ import xarray
 from harness import Ensemble, Row
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 import torchchain as tc
@@ -24,6 +25,8 @@ from torchchain.theory import born_rates, effective_medium, theory_transfer
 
 WAYS = ("theory", "ladder alone")
 HISTOGRAM = 60
+FAILS = 0.02  # total variation of one source at one time
+STYLES = ("-", "--", ":", "-.")
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     shape = (len(config.strengths), len(t))
     error, late = np.empty((2, *shape)), np.empty((2, shape[0]))
     noise, estimate, decay = np.empty(shape), np.empty(shape), np.empty((3, *shape))
-    late_noise = np.empty(shape[0])
+    late_noise, by_band = np.empty(shape[0]), np.empty((*shape, config.n_bands))
     cost = np.empty((2, shape[0]))
     sampled, sampled_cost = np.empty((len(config.sizes), shape[0])), np.empty((len(config.sizes), shape[0]))
     rates = {}
@@ -87,6 +90,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             cost[way, i] = time.process_time() - began
             error[way, i] = distance(results[-1].mean, chains.mean)
             late[way, i] = distance(results[-1].long_time[:, None], chains.long_time[:, None])[0]
+        by_band[i] = (results[0].mean - chains.mean).abs().sum(-1).T / 2
         expected = math.sqrt(2 / math.pi) / 2
         noise[i] = expected * chains.stderr.sum(-1).mean(0)
         late_noise[i] = expected * float(chains.long_time_stderr.sum(-1).mean())
@@ -109,6 +113,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     return xarray.Dataset(
         {
             "error": (("way", "strength", "time"), error, {"long_name": "mean total variation from chains"}),
+            "by_band": (("strength", "time", "source"), by_band, {"long_name": "total variation of each source"}),
             "late_error": (("way", "strength"), late, {"long_name": "the same at infinite time"}),
             "noise": (("strength", "time"), noise, {"long_name": "part of it that is the chains' own error"}),
             "late_noise": (("strength",), late_noise),
@@ -227,22 +232,16 @@ def _draw_cost(ax: Axes, data: xarray.Dataset, config: Config) -> None:
 
 
 def _draw_edges(ax: Axes, data: xarray.Dataset, config: Config) -> None:
-    mean, xi = _mean_error(data, config), list(config.strengths)
-    ax.plot(xi, mean[0], "o-", label="theory, mean over times")
-    ax.plot(xi, data.late_error[0], "s-", label="theory, infinite time")
-    ax.plot(xi, data.error[0].max("time"), "v-", label="theory, worst time")
-    ax.plot(
-        xi, data.estimate.where(data.time >= config.step).mean("time"), "k:", label="its own estimate, mean over times"
-    )
-    ax.plot(xi, data.late_error[1], "--", color="C3", label="ladder alone, infinite time")
-    ax.plot(xi, data.noise.isel(time=-1), ":", color="gray", label="chains' own error")
-    ax.set(
-        xlabel="disorder $\\xi$",
-        ylabel="mean total variation from chains",
-        ylim=(0, 1.7 * float(data.late_error.max())),
-        title="where the theory fails",
-    )
-    ax.legend(fontsize=8, loc="upper left", ncols=2)
+    """Lines around where a source's energies are wrong by FAILS or more."""
+    later = data.by_band.sel(time=slice(config.step, None))
+    for i, xi in enumerate(config.strengths):
+        smooth = gaussian_filter(later.isel(strength=i).values, 1.0)
+        ax.plot([], [], STYLES[i % len(STYLES)], color=f"C{i}", label=f"$\\xi$ = {xi:g}")
+        if smooth.max() > FAILS > smooth.min() and min(smooth.shape) > 1:
+            ax.contour(later.time, later.source, smooth.T, [FAILS], colors=f"C{i}", linestyles=STYLES[i % len(STYLES)])
+    ax.set(xscale="log", xlabel=plots.TIME_LABEL, ylabel="source band", xlim=(config.step, config.stop), ylim=(1, config.n_bands + 1),
+           title=f"where the theory fails: total variation\nof a source above {FAILS:g} inside the lines")  # fmt: skip
+    ax.legend(fontsize=8, loc="upper right")
 
 
 def _mean_error(data: xarray.Dataset, config: Config) -> np.ndarray:
@@ -259,10 +258,22 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
             Row(f"{label}: theory, mean over times", float(mean[0, i]), note=f"chains' own {float(data.noise[i, -1]):.4f}"),
             Row(f"{label}: theory, infinite time", float(data.late_error[0, i]), note=f"chains' own {float(data.late_noise[i]):.4f}"),
             Row(f"{label}: theory, worst time", float(data.error[0, i].max()), note=f"t = {worst[i]:g}"),
+            _worst_source(data, i, label),
             Row(f"{label}: ladder alone, mean over times", float(mean[1, i])),
             Row(f"{label}: theory, processor seconds", float(data.cost[0, i])),
         ]  # fmt: skip
     return rows
+
+
+def _worst_source(data: xarray.Dataset, i: int, label: str) -> Row:
+    one = data.by_band.isel(strength=i)
+    place = one.argmax(("time", "source"))
+    worst = one.isel(place)
+    share = float((one > FAILS).mean())
+    note = (
+        f"band {int(worst.source)}, t = {float(worst.time):g}; {100 * share:.0f} % of sources and times above {FAILS:g}"
+    )
+    return Row(f"{label}: theory, worst source and time", float(worst), note=note)
 
 
 def explain(data: xarray.Dataset, config: Config) -> str:

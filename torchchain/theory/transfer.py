@@ -153,9 +153,7 @@ def transfer_of_law(
                 )
             error[s] = doubt
             if localization:
-                part = first * fading(times) / (1 + (_distance(crossed[s]) / numbers.most) ** 4)
-                part = torch.minimum(part, _room(mean[s], crossed[s]))[:, None]
-                mean[s] += part * crossed[s] + (1 - part) * change
+                mean[s] += added(mean[s], crossed[s], change, first * fading(times), numbers)
             else:
                 error[s] += _distance(change)
             if damping == 0:
@@ -203,10 +201,13 @@ def _faded(ladder: Tensor, settled: Tensor, times: Tensor) -> Tensor:
     return settled + rest[1] * torch.exp(-rate * (times - FADING))[:, None]
 
 
-def _room(energy: Tensor, change: Tensor) -> Tensor:
-    """Times change that energy bears, (time,), before a band has less than nothing (or than it had), _SLACK aside."""
-    spare = energy.clamp(min=0) + _SLACK
-    return torch.where(change < 0, spare / (-change).clamp(min=1e-300), math.inf).amin(-1)
+def added(ladder: Tensor, crossed: Tensor, change: Tensor, first: Tensor, numbers: Return) -> Tensor:
+    """What interference adds to the ladder, (time, band): two particles' as far as it is a small correction, and bands have
+    the energy (_SLACK aside), and for the rest that of localized modes."""
+    spare = ladder.clamp(min=0) + _SLACK
+    room = torch.where(crossed < 0, spare / (-crossed).clamp(min=1e-300), math.inf).amin(-1)
+    part = torch.minimum(first / (1 + (_distance(crossed) / numbers.most) ** 4), room)[:, None]
+    return part * crossed + (1 - part) * change
 
 
 def _distance(change: Tensor) -> Tensor:
