@@ -182,6 +182,15 @@ def test_crossed_scattering_is_what_the_ladder_lacks_at_early_times(chains):
     assert float(distance(whole, measured)) < 0.6 * float(distance(ladder, measured))
 
 
+def test_theory_is_negative_where_chains_are(chains):
+    """The kinetic energy of definition "site" is no square: an ensemble's mean can be below 0, and only there is the theory."""
+    result = theory_transfer(tc.Disorder(strength=0.2), 64, 8, TIMES).mean
+    below = chains.mean < -5 * chains.stderr - 2e-5
+    assert int(below.sum()) > 3
+    assert bool((result[below] < 0).all())
+    assert bool((result[chains.mean > 3 * chains.stderr + 2e-5] > -2e-5).all())
+
+
 def test_localization_is_what_the_ladder_lacks_at_late_times(chains):
     disorder = tc.Disorder(strength=0.2)
     whole, ladder = (theory_transfer(disorder, 64, 8, TIMES, localization=x) for x in (True, False))

@@ -128,7 +128,7 @@ def source_frequencies(law: Law, waves: Waves, edge: float, points: int = 4) -> 
     ):  # fmt: skip
         panel = torch.from_numpy((half[:, None] * weight).ravel())
         line = (1 / (source - e)).imag.clamp(min=0) * (w if waves.momentum else 1 / w) * panel
-        used = line > 1e-12 * line.sum()
+        used = line > 1e-8 * line.sum()
         w, e, line = w[used], e[used], line[used]
         spectral = weights * squares * (1 / (squares - e)).imag.clamp(min=1e-300)
         width = 2 * wavenumber(e).imag
