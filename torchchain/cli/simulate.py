@@ -60,12 +60,12 @@ def _leave(run: Run, scene: Scene, data: xarray.Dataset) -> None:
 def _last(data: xarray.Dataset, name: str) -> tuple[str, float, float] | None:
     """An observable at the last time and its standard error: the number, or the largest of several; of tones, that of the figure."""
     values, error = data[name], data[f"{name}_stderr"]
-    when = " at the last time" if "time" in values.dims else ""
+    when = ""
+    if "time" in values.dims:
+        values, error, when = values.isel(time=-1), error.isel(time=-1), " at the last time"
     if "tone" in values.dims:
         values, error = (part.isel(tone=values.sizes["tone"] // 2) for part in (values, error))
         when += f", tone {int(values.tone)}"
-    if when:
-        values, error = values.isel(time=-1), error.isel(time=-1)
     if values.ndim > 1:
         return None
     if values.ndim:
