@@ -21,9 +21,10 @@ kernels of :mod:`stencil` do the same.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -156,33 +157,48 @@ def check_work(times: Tensor, frequency: float) -> None:
 
 def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> Advance:
     """The expansion in plain torch, from each output time to the next."""
+    pair = torch.stack([state.displacement, state.velocity], dim=frequency.ndim)
+    weight = chain.align((4 / frequency.square()).to(chain.masses)[..., None] / chain.masses, pair)
+    return expanded(chain.force, pair, weight, frequency, tolerance, Trajectory, -2)
+
+
+def expanded(
+    force: Callable[[Tensor], Tensor], pair: Tensor, weight: Tensor, frequency: Tensor, tolerance: float,
+    trajectory: Callable[..., Any], time_axis: int,
+) -> Advance:  # fmt: skip
+    """The expansion for any linear force, in plain torch.
+
+    Args:
+        force: of displacements like ``pair``.
+        pair: displacement and velocity, (*batch, 2, *state).
+        weight: 4 / (W^2 m), which broadcasts against a pair.
+        frequency: W, (*batch,).
+        tolerance: what truncation may leave out of a leap.
+        trajectory: makes the result from times, displacement and velocity.
+        time_axis: of these, counted from behind.
+    """
     from torchchain.evolvers.coefficients import coefficients_of  # imports Numba
 
-    axis = len(chain.batch_shape)
-    pair = torch.stack([state.displacement, state.velocity], dim=axis)
+    axis = frequency.ndim
     ahead = (None,) * (pair.ndim - axis - 1)  # axes of a state behind the batch
     frequencies = _numbers(frequency.reshape(-1))
-    weight = chain.align((4 / frequency.square()).to(chain.masses)[..., None] / chain.masses, pair)
     now = 0.0
 
     def step(pair: Tensor, time: np.ndarray) -> Tensor:
         table = torch.from_numpy(coefficients_of(frequencies, time, tolerance)).to(pair)
-        table = table.reshape(*table.shape[:2], *chain.batch_shape)[(..., *ahead)]
-        older, old = pair, pair + weight / 2 * chain.force(pair)
+        table = table.reshape(*table.shape[:2], *frequency.shape)[(..., *ahead)]
+        older, old = pair, pair + weight / 2 * force(pair)
         total: list[Tensor] = []
         for k in range(table.shape[1]):
             if k > 1:
-                older, old = old, 2 * old - older + weight * chain.force(old)
+                older, old = old, 2 * old - older + weight * force(old)
             displacement, velocity = (pair if k == 0 else old).unbind(axis)
             cosine, integral, derivative = table[:, k]
-            terms = [
-                cosine * displacement + integral * velocity,
-                cosine * velocity + derivative * displacement,
-            ]
+            terms = [cosine * displacement + integral * velocity, cosine * velocity + derivative * displacement]
             total = [a + b for a, b in zip(total, terms, strict=True)] if total else terms
         return torch.stack(total, dim=axis)
 
-    def advance(times: Tensor) -> Trajectory:
+    def advance(times: Tensor) -> Any:
         nonlocal pair, now
         check_work(times, frequencies.max())
         phase.check(times, frequency, pair.dtype)
@@ -191,11 +207,11 @@ def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> A
             # Each realization takes the leaps it needs by itself, and then rests.
             leaps = np.ceil(frequencies * (t - now) / LEAP)
             for leap in range(int(leaps.max())):
-                pair = step(pair, np.where(leap < leaps, (t - now) / leaps, 0.0))
+                pair = step(pair, np.where(leap < leaps, (t - now) / np.maximum(leaps, 1), 0.0))
             now = t
             outputs.append(pair)
-        displacement, velocity = torch.stack(outputs, dim=-2).unbind(axis)
-        return Trajectory(times, displacement, velocity)
+        displacement, velocity = torch.stack(outputs, dim=time_axis).unbind(axis)
+        return trajectory(times, displacement, velocity)
 
     return advance
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import State
 from torchchain.evolvers.chebyshev import METHOD as CHAINS
-from torchchain.evolvers.chebyshev import check_work, later_times, rounded_up
+from torchchain.evolvers.chebyshev import check_work, expanded, later_times, rounded_up
 from torchchain.evolvers.expansion import LEAP, LONGEST, ROUNDING, SEGMENTS, SHARED_PHASE
 from torchchain.evolvers.method import Advance
 from torchchain.modes import phase
@@ -100,44 +100,10 @@ def highest_frequency(network: Network, bound: float | Tensor | None = None) -> 
 
 def _plain(network: Network, state: State, frequency: Tensor, tolerance: float) -> Advance:
     """The expansion in plain torch, from each output time to the next."""
-    axis = len(network.batch_shape)
-    pair = torch.stack([state.displacement, state.velocity], dim=axis)
-    frequencies = frequency.reshape(-1).cpu().numpy()
+    pair = torch.stack([state.displacement, state.velocity], dim=frequency.ndim)
     weight = 1 / network.align(network.masses, pair)
     weight = weight * network.align((4 / frequency.square()).to(network.masses)[..., None], pair)
-    now = 0.0
-
-    from torchchain.evolvers.coefficients import coefficients_of  # imports Numba
-
-    def step(pair: Tensor, interval: np.ndarray) -> Tensor:
-        table = torch.from_numpy(coefficients_of(frequencies, interval, tolerance)).to(pair)
-        table = table.reshape(*table.shape[:2], *network.batch_shape, *[1] * (pair.ndim - axis - 1))
-        older, old = pair, pair + weight / 2 * network.force(pair)
-        total: list[Tensor] = []
-        for k in range(table.shape[1]):
-            if k > 1:
-                older, old = old, 2 * old - older + weight * network.force(old)
-            displacement, velocity = (pair if k == 0 else old).unbind(axis)
-            cosine, integral, derivative = table[:, k]
-            terms = [cosine * displacement + integral * velocity, cosine * velocity + derivative * displacement]
-            total = [a + b for a, b in zip(total, terms, strict=True)] if total else terms
-        return torch.stack(total, dim=axis)
-
-    def advance(times: Tensor) -> NetworkTrajectory:
-        nonlocal pair, now
-        check_work(times, frequencies.max())
-        phase.check(times, frequency, pair.dtype)
-        outputs = []
-        for t in later_times(times, now).tolist():
-            leaps = np.ceil(frequencies * (t - now) / LEAP)
-            for leap in range(int(leaps.max())):
-                pair = step(pair, np.where(leap < leaps, (t - now) / np.maximum(leaps, 1), 0.0))
-            now = t
-            outputs.append(pair)
-        displacement, velocity = torch.stack(outputs, dim=-3).unbind(axis)
-        return NetworkTrajectory(times, displacement, velocity)
-
-    return advance
+    return expanded(network.force, pair, weight, frequency, tolerance, NetworkTrajectory, -3)
 
 
 class CompiledAdvance:
