@@ -61,7 +61,7 @@ def fitted(transfer, degrees=DEGREES, **settings):
 def test_any_coefficients_make_shares_of_the_energy(size):
     model = random_model(size=size)
     times = torch.cat([torch.zeros(1), torch.logspace(-6, 6, 200), torch.tensor([math.inf])]).double()
-    found = model._at(times)
+    found = model.at(times)
     assert bool(found.isfinite().all())
     assert float(found.min()) >= 0
     assert float((found.sum(-1) - 1).abs().max()) <= model.certificate.conservation_defect

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -176,6 +177,52 @@ def test_too_few_blocks_hold_nothing_out():
     assert master.uncertainty is None
 
 
+@pytest.mark.parametrize(("kind", "strength"), [("binary", 0.5), ("binary", 0.9), ("lognormal", 0.7), ("gamma", 0.9)])
+def test_strong_disorder_of_other_kinds(kind, strength):
+    """Fresh chains are missed by what two ensembles are apart, within the error bars, and nothing is ever negative."""
+    times = np.concatenate([np.arange(0, 4, 0.5), np.arange(4, 41, 3)])
+    disorder = tc.Disorder(kind, strength)
+    scene = tc.Scene(n_particles=48, n_bands=6, realizations=80, disorder=disorder, times=times)
+    own, fresh = (tc.band_transfer(replace(scene, seed=seed), method="modes") for seed in (0, 1))
+    master = tc.calibrate(own, bootstrap=8)
+    assert "compact" in [rung.model for rung in master.calibration.report.selection.tried]
+    assert master.calibration.report.certificate.holds
+    late = torch.logspace(-2, 6, 60, dtype=torch.float64)
+    assert float(master.model.transfer(late).min()) >= -1e-12
+    found = master.model.transfer(own.times)
+    if strength < 0.9 or kind != "binary":  # masses 19 times apart ring as no model here does
+        off, noise = (tc.total_variation(each, fresh.mean)[:, 1:].mean() for each in (found, own.mean))
+        assert float(off) < 1.25 * float(noise)
+    error = master.standard_error(torch.eye(6, dtype=torch.float64), own.times).square() + fresh.stderr.square()
+    assert 0.55 < float(((found - fresh.mean).square() <= error)[:, 1:].double().mean()) < 0.85
+
+
+def test_listed_times_choose_as_well_as_times_by_logarithm():
+    """However its times are spaced, a model is chosen that is right early and late."""
+    scene = tc.Scene(n_particles=48, n_bands=6, realizations=40)
+    spaced = [torch.linspace(0, 500, 501), torch.cat([torch.zeros(1), torch.logspace(-1, math.log10(500), 60)])]
+    seen = torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 500.0], dtype=torch.float64)
+    fresh = tc.band_transfer(replace(scene, seed=1, realizations=100, times=seen), method="modes")
+    for times in spaced:
+        own = tc.band_transfer(replace(scene, times=times), method="modes")
+        off = tc.total_variation(tc.calibrate(own, bootstrap=0).model.transfer(seen), fresh.mean).mean(0)
+        ensembles = tc.statistical_distance(fresh.stderr).mean(0) * math.sqrt((1 + 100 / 40) / 2)  # of 40 and of 100 chains
+        assert all(float(off[part].mean()) < 1.5 * float(ensembles[part].mean()) for part in (seen <= 8, seen > 8))
+
+
+def test_coarse_times_are_no_reason_to_refuse():
+    """The slopes in a window are a comparison for models without rates, and needed by those with rates alone."""
+    scene = tc.Scene(n_particles=64, n_bands=8, realizations=20, times=[0.0, 5.0, 10.0, 20.0, 40.0, 80.0])
+    transfer = tc.band_transfer(scene, method="modes")
+    for settings in ({}, {"model": "compact"}, {"model": "memory", "order": (1, 1)}):
+        master = tc.calibrate(transfer, bootstrap=0, **settings)
+        assert master.calibration.window == (0.0, 5.0)
+    slopes = (transfer.mean[:, 1] - transfer.mean[:, 0]) / 5
+    assert torch.allclose(master.rates, slopes, rtol=0, atol=1e-15)
+    with pytest.raises(FieldError, match="window must hold at least 2 of the transfer's times"):
+        tc.calibrate(transfer, model="paper", bootstrap=0)
+
+
 # Error bars
 
 
@@ -247,8 +294,6 @@ def test_negative_energies_warn():
 
 
 def test_what_a_scene_asks_beyond_the_calibration(small_transfer):
-    from dataclasses import replace
-
     master = tc.calibrate(small_transfer)
     scene = small_transfer.scene
     assert master.concerns(scene) == []

@@ -24,7 +24,7 @@ from torchchain.master.rates import RateModel
 from torchchain.master.records import Fit, NoSettings, Recipe, ReducedModel
 from torchchain.master.report import Calibration, Report
 from torchchain.master.sample import Sample, loss_of
-from torchchain.master.selection import select
+from torchchain.master.selection import nearest_sure, select
 from torchchain.master.starts import can_fit, fit_starts, with_errors
 from torchchain.master.uncertainty import draw_again, horizon
 from torchchain.progress import bar
@@ -65,12 +65,22 @@ def recipe(
         checks.known_keys(f"settings of method '{fit.name}'", settings, fit.settings_names)
         chosen, n_times, given = fit.settings(**settings), fit.least_times, fit.window
         fit.check(chosen, len(data.times))
+    if window is None and (record is None or not issubclass(record.kind, RateModel)):
+        given = _widened(given, data)
     given = checked_window(given if window is None else window)
     if not data.is_ordered:
         if record is not None:
             record.check_scene(data if isinstance(data, Scene) else data.scene)
         within(data.times, given, n_times)
     return Recipe(record, fit, given, chosen)
+
+
+def _widened(window: tuple[float, float], data: Scene | BandTransfer) -> tuple[float, float]:
+    """The window, or the first two times where it holds no two: models with no rates need slopes for comparison only."""
+    times = data.times
+    if int(((times >= window[0]) & (times <= window[1])).sum()) >= 2 or len(times) < 2:
+        return window
+    return float(times[0]), float(times[1])
 
 
 def _owner(settings: dict[str, Any]) -> tuple[ReducedModel, Fit]:
@@ -118,7 +128,8 @@ def calibrate(
         model: "paper" (basis energy Psi of Eq. 47), "exact_psi", "basis_matrix", "swing_in", "compact", "memory" (all but the
             first need the long-time average) or a registered one; None: the richest that the method fits. Where the
             transfer has no long-time average and no model is named, that of the later half of its times serves, with a warning.
-        window: first and last time of the fits at short times; None for 0.5 to 2, "nonlinear" 0.5 to 4.5.
+        window: first and last time of the fits at short times; None for 0.5 to 2, "nonlinear" 0.5 to 4.5. Models without
+            rates need no such fit: where their times are too coarse, the slopes they keep are those of the first two.
         bootstrap: number of ensembles drawn again for the error bars, 0 for none; None for 20, or none with methods
             that would take long ("adam", "nonlinear") and with fewer than 4 blocks of realizations.
         progress: show a bar if the output is a terminal.
@@ -158,7 +169,14 @@ def calibrate(
         fitted, told = asked.run(sample, near, shown.update)
         free, proof = fitted, None
         if isinstance(fitted, MemoryModel) and isinstance(told, ProjectionReport) and not sample.damped:
-            fitted, told, proof = certified(transfer, asked, (fitted, told), report.selection is not None, shown.update)
+            other = None if report.selection is None else nearest_sure(asked, report.selection)
+            fitted, told, proof = certified(
+                transfer, asked, (fitted, told), report.selection is not None, shown.update, other is not None
+            )
+            if proof is None and other is not None:  # nothing that may be negative is handed out where another can be had
+                asked = other
+                fitted, told = asked.run(sample, None, shown.update)
+                free = fitted
         report = replace(
             report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=count,
             certificate=fitted.certificate if isinstance(fitted, CompactModel | TheoryModel) else proof,

@@ -27,7 +27,7 @@ DIVERGES = 0.1
 
 
 def certified(
-    transfer: BandTransfer, asked: Recipe, free: Fitted, mend: bool, progress: Progress = None
+    transfer: BandTransfer, asked: Recipe, free: Fitted, mend: bool, progress: Progress = None, spare: bool = False
 ) -> tuple[TransferModel, ProjectionReport, Certificate | None]:
     """The model that is never negative, with its proof, in place of a free fit, where it is as near to the ensemble.
 
@@ -37,10 +37,11 @@ def certified(
         free: the fit and its report.
         mend: whether another model may take the place of the free fit; not where its order was asked for.
         progress: called with 1 after every order.
+        spare: whether another model takes its place where none is found.
 
     Returns:
-        The model, the report of the fit that found its decay rates, and its certificate; the free fit where no other is
-        as good, with a certificate if it has one.
+        The model, the report of the fit that found its decay rates, and its certificate: the nearest where none is as
+        good; the free fit where no other was found, with a certificate if it has one.
 
     Warns:
         FitWarning: if the model that is left diverges, or is farther from the ensemble because the free fit diverged.
@@ -68,8 +69,9 @@ def certified(
                 f"{nearest[0]:.3g} from the ensemble in place of {far:.3g}", FitWarning, stacklevel=3,
             )  # fmt: skip
             return nearest[1:]
-        warnings.warn(f"{wild}: do not predict other times than it was fitted to", FitWarning, stacklevel=3)
-    return model, told, None
+        if not spare:
+            warnings.warn(f"{wild}: do not predict other times than it was fitted to", FitWarning, stacklevel=3)
+    return (model, told, None) if nearest is None else nearest[1:]
 
 
 def _found(

@@ -169,7 +169,7 @@ class CompactModel(TransferModel):
         """Pi [source, receiver], T at infinite time."""
         if self.loss.numel():
             return torch.zeros_like(self._rates)
-        return self._at(self._rates.new_full((1,), math.inf))[:, 0]
+        return self.at(self._rates.new_full((1,), math.inf))[:, 0]
 
     @property
     def damping(self) -> Tensor:  # type: ignore[override]
@@ -215,7 +215,7 @@ class CompactModel(TransferModel):
         self._place, self._own = fn(self._place), fn(self._own)
         return self
 
-    def _at(self, times: Tensor, sources: Tensor | None = None) -> Tensor:
+    def at(self, times: Tensor, sources: Tensor | None = None) -> Tensor:
         """T of undamped chains at times that may be infinite, (source, time, receiver), of all sources or some, by number."""
         sources = torch.arange(self.n_bands, device=times.device) if sources is None else sources
         odds = first_odds(self.waves, times, sources)
@@ -229,7 +229,7 @@ class CompactModel(TransferModel):
 
     def _moved(self, times: Tensor, sources: Tensor | None = None) -> Tensor:
         """T, (source, time, receiver), of all sources or some."""
-        found = self._at(times, sources)
+        found = self.at(times, sources)
         if not self.loss.numel():
             return found
         modes = frequencies(self.loss.shape[1])

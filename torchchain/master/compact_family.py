@@ -1,4 +1,4 @@
-"""Compact models of several strengths of disorder, fitted together: their coefficients are polynomials of xi.
+"""Compact models of several strengths of disorder, fitted together: their coefficients are polynomials of sqrt(xi).
 
 The waves of a strength are known, and D is proportional to xi^2: what the coefficients have to tell changes slowly with xi.
 Any coefficients make a model that is never negative and conserves energy, so every strength in between has one.
@@ -18,7 +18,7 @@ from torch import Tensor
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master.compact import CompactModel, checked_degrees
+from torchchain.master.compact import CompactModel, checked_degrees, n_coefficients
 from torchchain.master.compact_record import (
     CompactReport,
     check_scene,
@@ -28,9 +28,10 @@ from torchchain.master.compact_record import (
     regression_of,
     shares_of,
 )
+from torchchain.master.derived import THEORY, TheoryModel, compared
 from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import linear_weights
-from torchchain.master.logistic import Regression, solve, stepped
+from torchchain.master.logistic import Regression, fit_compact, solve, stepped
 from torchchain.master.misfit import model_error
 from torchchain.master.report import Calibration, Report
 from torchchain.master.sample import Sample
@@ -40,16 +41,25 @@ from torchchain.threads import single_blas_thread
 
 DEGREES = (9, 6, 14)
 SETS = 5
-"""Polynomials of xi, at most: 1,410 fitted numbers with these degrees."""
+"""Polynomials of sqrt(xi), at most: 1,410 fitted numbers with these degrees."""
 STIFFNESS = 1000.0
 """Ridge of the first of them, relative to that of a model alone; the next have 4, 9, 16 times as much."""
+THEORY_TIMES = torch.cat([torch.linspace(0.25, 3, 12), torch.logspace(math.log10(3.5), math.log10(400), 36)]).double()
+THEORY_FROM = (5.0, 50.0)
+"""Before the first of these times perturbation theory is exact to more digits than the theory has, from the second on it is not."""
+THEORY_ERROR = 0.3
+"""Distance to which the theory is followed, of the energy that has moved: for coefficients that are small, and change slowly."""
 WEAKEST = 1e-9
 """In place of no disorder, where nothing moves."""
 
 
 def polynomials_of(strengths: Sequence[float], known: Sequence[float], sets: int) -> np.ndarray:
-    """Chebyshev's polynomials in xi from the lowest to the highest known strength, (strength, set)."""
-    x = (2 * np.asarray(strengths) - known[0] - known[-1]) / max(known[-1] - known[0], 1e-12)
+    """Chebyshev's polynomials in sqrt(xi) from the lowest to the highest known strength, (strength, set).
+
+    Of strengths that grow by a like factor, say, polynomials in xi itself swing between the highest.
+    """
+    low, high = math.sqrt(known[0]), math.sqrt(known[-1])
+    x = (2 * np.sqrt(strengths) - low - high) / max(high - low, 1e-12)
     return np.polynomial.chebyshev.chebvander(np.clip(x, -1, 1), sets - 1)
 
 
@@ -65,7 +75,8 @@ def between(members: Sequence[MasterEquation], scene: Scene, sets: int, power: i
     """The model of a scene whose strength may lie between those of members that were fitted together.
 
     Below the lowest strength the coefficients go to zero as xi^2, for D is perturbation theory, exact in that limit, and what
-    it leaves out is of order xi^2 t. What damped chains have left is a mixture of that of the nearest two strengths.
+    it leaves out is of order xi^2 t; where the theory of disorder describes the chains, what goes to zero is the difference
+    from its own coefficients. What damped chains have left is a mixture of that of the nearest two strengths.
     """
     known = [member.calibration.strength or WEAKEST for member in members]
     strength = max(scene.disorder.strength, WEAKEST)
@@ -81,8 +92,33 @@ def between(members: Sequence[MasterEquation], scene: Scene, sets: int, power: i
     mixed = {name: summed(name, near) for name in ("rates", "loss")}
     mixed["coefficients"] = summed("coefficients", weights(strength, known, sets).tolist())
     if strength < known[0]:
-        mixed["coefficients"] *= ((strength**2 + beside**2) / (known[0] ** 2 + beside**2)) ** (power / 2)
+        lowest = replace(scene, disorder=replace(scene.disorder, strength=known[0]))
+        here, there = (_told_by_theory(each, tensors[0]["degrees"]) for each in (scene, lowest))
+        share = ((strength**2 + beside**2) / (known[0] ** 2 + beside**2)) ** (power / 2)
+        mixed["coefficients"] = here + share * (mixed["coefficients"] - there)
     return CompactModel(**tensors[0] | mixed | waves.tensors())
+
+
+def _told_by_theory(scene: Scene, given: Tensor) -> Tensor:
+    """Coefficients, of given degrees, of the compact form for what the theory of disorder says of chains; zero if nothing."""
+    degrees = checked_degrees([int(degree) for degree in given])
+    if scene.damping or not compared(scene) or not THEORY.describes(scene):
+        return torch.zeros(n_coefficients(degrees), dtype=torch.float64)
+    times = torch.cat([THEORY_TIMES, THEORY_TIMES.new_tensor([math.inf])])
+    none = torch.zeros(n_coefficients(degrees), dtype=torch.float64)
+    plain = CompactModel(
+        rates=torch.zeros(scene.n_bands, scene.n_bands, dtype=torch.float64), degrees=given.double(), coefficients=none,
+        **Waves.of(scene).tensors(),
+    ).at(times)  # fmt: skip
+    late = (times.log() - math.log(THEORY_FROM[0])) / math.log(THEORY_FROM[1] / THEORY_FROM[0])
+    transfer = torch.lerp(plain, TheoryModel.of(scene).transfer(times), late.clamp(0, 1)[:, None])
+    with single_blas_thread():
+        moved = 1 - transfer[:, :-1].diagonal(dim1=0, dim2=2).mean(-1)
+        model, _ = fit_compact(
+            transfer[:, 0], Waves.of(scene), degrees, THEORY_TIMES, transfer[:, :-1], transfer[:, -1],
+            THEORY_ERROR * moved,
+        )  # fmt: skip
+    return model.coefficients
 
 
 def nearest(strength: float, known: Sequence[float]) -> list[float]:
@@ -100,7 +136,7 @@ def fit_together(
     Args:
         samples: of chains that differ in the strength of their masses' disorder, in order of it.
         degrees: of the polynomials in place, distance and time.
-        sets: polynomials of xi, no more than there are samples.
+        sets: polynomials of sqrt(xi), no more than there are samples.
         progress: called with 1 after every step.
     """
     problems = [regression_of(sample, degrees) for sample in samples]
@@ -235,7 +271,7 @@ def errors_between(
     """Error bars of the model of a scene between those of members: theirs, and by how much interpolation may be off.
 
     Errors of the odds are interpolated between the nearest two strengths. What interpolation is off by is taken from the
-    distance to a polynomial of xi of one degree less.
+    distance to a polynomial of sqrt(xi) of one degree less.
     """
     held = [(member, member.uncertainty) for member in members if member.uncertainty is not None]
     if len(held) < len(members):

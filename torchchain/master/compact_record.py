@@ -50,7 +50,7 @@ class CompactReport:
         steps: that it took.
         misfit: root mean square, in units of the error.
         degrees: of the polynomials in place, distance and time.
-        sets: polynomials of xi that the coefficients of a family are made of; 0 for a model alone.
+        sets: polynomials of sqrt(xi) that the coefficients of a family are made of; 0 for a model alone.
     """
 
     converged: bool

@@ -35,7 +35,7 @@ NEIGHBORS = 4
 class MasterFamily(Printed):
     """Master equations of the same bands and chains for several strengths xi of the disorder.
 
-    Compact models are fitted together, with coefficients that are polynomials of xi: a strength between them has its
+    Compact models are fitted together, with coefficients that are polynomials of sqrt(xi): a strength between them has its
     own, which is never negative and conserves energy. Members that were calibrated alone are first fitted together to
     what they predict.
 
@@ -91,7 +91,7 @@ class MasterFamily(Printed):
 
     @property
     def _sets(self) -> int:
-        """Polynomials of xi that the members' coefficients are made of, 0 if they were not fitted together."""
+        """Polynomials of sqrt(xi) that the members' coefficients are made of, 0 if they were not fitted together."""
         reports = [member.calibration.report.fit for member in self.members]
         if not all(isinstance(report, CompactReport) for report in reports) or len({*reports}) > 1:
             return 0

@@ -23,6 +23,8 @@ AS_GOOD = 1.1
 """Foreseen distance, over that of the nearest model, of a smaller one that takes its place."""
 LARGE = 500
 """Fitted numbers beyond which a model is tried only where no smaller one will do."""
+MANY = 10**9
+"""Times that tell all rungs of a model apart."""
 SEEN = 128
 """Times at which models are compared with the half that they have not seen."""
 ENOUGH = 1.05
@@ -131,6 +133,18 @@ def select(
     reached = "reaches" if enough else "comes nearest to"
     reason = f"smallest model that {reached} the distance of the two halves of the ensemble"
     return chosen[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best]
+
+
+def nearest_sure(asked: Recipe, selection: Selection) -> Recipe | None:
+    """Of the rungs that were tried, the nearest whose energies are never negative by its form."""
+    sure = [rung for rung in selection.tried if MODELS[rung.model].never_negative]
+    if not sure:
+        return None
+    rung = min(sure, key=lambda each: each.distance)
+    record = MODELS[rung.model]
+    fit = record.fit(record.climbed_by or "")
+    settings = next(s for s in record.rungs(MANY) if replace(asked, model=record, fit=fit, settings=s).order == rung.order)
+    return replace(asked, model=record, fit=fit, settings=settings)
 
 
 def foreseen(halves: Tensor, missed: Tensor, spread: Tensor) -> Tensor:
