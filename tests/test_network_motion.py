@@ -102,9 +102,9 @@ def test_renumbering_leaves_the_particles_in_place(monkeypatch):
 def test_steps_of_one_sweep_are_those_made_one_by_one(motion, monkeypatch):
     monkeypatch.setattr(layouts, "TILE", layouts.WINDOW)
     monkeypatch.setattr(layouts, "RENUMBER", 0)
-    grid = nw.displaced(nw.lattice("square", (64, 12)), 0.3, seed=3)  # particles with none to many neighbors
+    grid = nw.displaced(nw.lattice("square", (36, 36)), 0.3, seed=3)  # particles with none to many neighbors
     radii = torch.full((grid.n_particles,), 0.62, dtype=torch.float64)
-    disks = tc.packing(grid.positions, radii, grid.masses, [64.0, 12.0], prestress=False)
+    disks = tc.packing(grid.positions, radii, grid.masses, [36.0, 36.0], prestress=False)
     network = replace(disks, motion=motion)
     state = random_state(network)
     swept = layouts.Gathered(network)

@@ -74,8 +74,7 @@ class Gathered:
         self.tiles = np.searchsorted(self.runs, np.append(np.arange(0, n, TILE), n))
         self.parts, self.n, self.components = len(self.tiles) - 1, n, c
         inside = self.ends < n
-        apart = int(np.abs(self.ends - owner[sort])[inside].max(initial=0))
-        self.lag = max(1, -(-apart // TILE))
+        self.lag = int(np.abs(self.ends // TILE - owner[sort] // TILE)[inside].max(initial=1))
         held = self.lag * TILE * (8 * (4 * c + 1) + len(self.ends) / n * (4 + 8 * c))
         self.depth = int(np.clip(SWEPT / held, 1, DEEPEST))
         self.masses = _flat(network.masses)[:, self.order]
