@@ -58,7 +58,13 @@ def legends_below(figure: Any, columns: int = 2) -> None:
         widest = max(map(len, labels))
         across = 1 if widest > 24 else columns if widest > 10 else columns + 1
         title = found.get_title().get_text()
-        legend(ax, across, handles=found.legend_handles, labels=labels, **({"title": title, "title_fontsize": 7} if title else {}))
+        legend(
+            ax,
+            across,
+            handles=found.legend_handles,
+            labels=labels,
+            **({"title": title, "title_fontsize": 7} if title else {}),
+        )
         where = ax.get_subplotspec()
         row = 0 if where is None else where.rowspan.start
         rows[row] = max(rows.get(row, 0), -(-len(labels) // across) + bool(title))

@@ -99,7 +99,12 @@ def _figure(a: xarray.Dataset, b: xarray.Dataset, found: list[Agreement]) -> Any
             mean = np.sqrt((z**2).mean([axis for axis in z.dims if axis != "time"]))
             ax.plot(z["time"], mean, label="these results")
             ax.axhline(1, color="k", ls="--", label="one ensemble")
-            ax.set(xlabel=plots.TIME_LABEL, ylabel="root mean square $z$-score", ylim=(0, None), title=name.replace("_", " "))
+            ax.set(
+                xlabel=plots.TIME_LABEL,
+                ylabel="root mean square $z$-score",
+                ylim=(0, None),
+                title=name.replace("_", " "),
+            )
             plots.legend(ax)
         for ax in list(axes.flat)[len(panels) :]:
             ax.set_axis_off()

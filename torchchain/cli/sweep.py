@@ -266,9 +266,7 @@ LABELS = {
 }  # fmt: skip
 
 
-def _figure(
-    fields: Mapping[str, Sequence[Any]], shown: Mapping[str, tuple[np.ndarray, np.ndarray | None]]
-) -> Any:
+def _figure(fields: Mapping[str, Sequence[Any]], shown: Mapping[str, tuple[np.ndarray, np.ndarray | None]]) -> Any:
     """Every quantity over the first field, one line for each combination of the others that vary."""
     columns = min(3, len(shown))
     rows = math.ceil(len(shown) / columns)

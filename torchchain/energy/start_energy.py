@@ -97,7 +97,9 @@ def start_energy(chain: Chain, state: State) -> StartEnergy:
     require_linear(chain, "an ensemble of chains")
     n = chain.n_particles
     if not chain.is_free or n % 2:
-        raise checks.fail("chain", "be a ring of an even number of particles for energies by tone", f"{chain.boundary}, {n}")
+        raise checks.fail(
+            "chain", "be a ring of an even number of particles for energies by tone", f"{chain.boundary}, {n}"
+        )
     chain.align(chain.masses, state.displacement)
     here = Trajectory(torch.zeros(1), state.displacement[..., None, :], state.velocity[..., None, :])
     still = Trajectory(here.times, here.displacement, torch.zeros_like(here.velocity))
@@ -124,7 +126,9 @@ def start_energy(chain: Chain, state: State) -> StartEnergy:
 
 
 def _ratio(part: Tensor, whole: Tensor) -> Tensor:
-    return torch.where(whole > 0, part.clamp(min=0) / whole.clamp(min=torch.finfo(whole.dtype).tiny), torch.zeros_like(whole))
+    return torch.where(
+        whole > 0, part.clamp(min=0) / whole.clamp(min=torch.finfo(whole.dtype).tiny), torch.zeros_like(whole)
+    )
 
 
 def excited(excitation: Any, n_particles: int, dtype: torch.dtype = torch.float64) -> StartEnergy:

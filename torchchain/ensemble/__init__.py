@@ -4,6 +4,7 @@ from torchchain.ensemble.checkpoint import Checkpoint, CheckpointWarning
 from torchchain.ensemble.estimate import estimate_disorder
 from torchchain.ensemble.fused import energy_moments
 from torchchain.ensemble.measured_transfer import band_transfer
+from torchchain.ensemble.network_ensembles import network_transfer
 from torchchain.ensemble.observables import OBSERVABLES, Observable, register_observable
 from torchchain.ensemble.plan import Plan
 from torchchain.ensemble.provenance import Provenance
@@ -14,6 +15,6 @@ from torchchain.ensemble.transfer import BandTransfer
 
 __all__ = [
     "OBSERVABLES", "BandTransfer", "Checkpoint", "CheckpointWarning", "Observable", "Plan", "Provenance", "Scene",
-    "band_transfer", "energy_moments", "estimate_disorder", "register_observable", "simulate", "statistical_distance",
+    "band_transfer", "energy_moments", "estimate_disorder", "network_transfer", "register_observable", "simulate", "statistical_distance",
     "total_variation",
 ]  # fmt: skip

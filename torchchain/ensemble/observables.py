@@ -121,7 +121,9 @@ def _band_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
         each = species_band_energy(mixed, trajectory, labels, count, scene.bands_each)
         share = each.flatten(-2)
     else:
-        share = systems.band_energy(chain, trajectory, scene.n_bands, scene.largest_damping == 0, _of_wavenumbers(scene))
+        share = systems.band_energy(
+            chain, trajectory, scene.n_bands, scene.largest_damping == 0, _of_wavenumbers(scene)
+        )
         if scene.largest_damping == 0:
             return share
     return share / systems.total_energy(chain, _start(scene, chain, trajectory))[..., None]
@@ -268,4 +270,9 @@ def chosen_observables(names: Sequence[str]) -> list[Observable]:
 def is_fused(method: str, scene: Scene) -> bool:
     """Whether the stencil's kernels measure all that is measured in time: the bands of all beads, or totals, centers and widths."""
     kinds = {entry.kernel for entry in chosen_observables(scene.observables) if entry.in_time}
-    return method == "chebyshev" and scene.lattice is None and not scene.by_species and (kinds == {"bands"} or kinds <= {"total", "center", "width"})
+    return (
+        method == "chebyshev"
+        and scene.lattice is None
+        and not scene.by_species
+        and (kinds == {"bands"} or kinds <= {"total", "center", "width"})
+    )

@@ -206,7 +206,9 @@ def _contact_words(models: tuple[ContactModel, ...]) -> str:
     """The ladder of contact laws, in words."""
     steps = [f"{each.name} {each.error:.1e} (enough to elongation {each.edge:.2g})" for each in models[:2]]
     least = next(each.name for each in models if each.enough)
-    return f"energies that Hertz contacts move between frequencies: {', '.join(steps)}; {least} contacts are enough here"
+    return (
+        f"energies that Hertz contacts move between frequencies: {', '.join(steps)}; {least} contacts are enough here"
+    )
 
 
 def _seconds(

@@ -324,7 +324,17 @@ class MasterEquation(Printed, nn.Module):
             found.append(f"times to {end:g}, compared with chains to {self.horizon:g}")
         if own is None:
             return [*found, "chains that are described, where its own energies came without a scene"]
-        others = ("lattice", "shape", "motion", "removed_bonds", "position_disorder", "species", "arrangement", "unlike", "by_species")
+        others = (
+            "lattice",
+            "shape",
+            "motion",
+            "removed_bonds",
+            "position_disorder",
+            "species",
+            "arrangement",
+            "unlike",
+            "by_species",
+        )
         for name in (*others, "boundary", "damping", "contact", "energy_definition"):
             if getattr(scene, name) != getattr(own, name):
                 found.append(f"{name} {getattr(scene, name)}, calibrated on {getattr(own, name)}")

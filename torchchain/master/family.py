@@ -76,7 +76,18 @@ class MasterFamily(Printed):
             scene = scene_of(member)
             if not isinstance(member.model, (CompactModel, MemoryModel)):
                 raise checks.fail("members", "have the model 'compact' or 'memory'", repr(member.calibration.model))
-            for name in ("n_particles", "n_bands", "boundary", "contact", "damping", "stiffness_disorder", "species", "arrangement", "unlike", "by_species"):
+            for name in (
+                "n_particles",
+                "n_bands",
+                "boundary",
+                "contact",
+                "damping",
+                "stiffness_disorder",
+                "species",
+                "arrangement",
+                "unlike",
+                "by_species",
+            ):
                 if getattr(scene, name) != getattr(first, name):
                     raise checks.fail(
                         "members", f"have the same {name}", f"{getattr(first, name)} and {getattr(scene, name)}"

@@ -249,7 +249,11 @@ def regression(
 
 
 def fit_points(
-    times: Tensor, mean: Tensor, long_time: Tensor | None = None, distance: Tensor | None = None, left: Tensor | None = None
+    times: Tensor,
+    mean: Tensor,
+    long_time: Tensor | None = None,
+    distance: Tensor | None = None,
+    left: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, np.ndarray]:
     """What a regression is held to: some of the times, and infinity if it is known; the transfer there; its weights.
 

@@ -44,7 +44,9 @@ class Certificate:
     def from_dict(cls, record: Mapping[str, Any]) -> Certificate:
         """The inverse of :meth:`to_dict`, checked."""
         checks.instance("report.certificate", record, dict)
-        record = {"conservation_defect" if name == "drift" else name: value for name, value in record.items()}  # of old files
+        record = {
+            "conservation_defect" if name == "drift" else name: value for name, value in record.items()
+        }  # of old files
         names = [entry.name for entry in fields(cls)]
         checks.known_keys("report.certificate", record, names)
         values: dict[str, Any] = {}

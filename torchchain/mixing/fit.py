@@ -83,7 +83,9 @@ def fit_triads(*data: Mixing, bootstrap: int = 20) -> TriadFit:
     unit = TriadModel(data[0].bands, density, torch.ones(len(triads_of(data[0].bands)[0])))
     coupling, misfit = _coupling([(entry.times, entry.energies) for entry in data], unit)
     draw = np.random.default_rng(data[0].scene.seed)
-    again = [_coupling([(entry.times, _drawn(entry.energies, draw)) for entry in data], unit)[0] for _ in range(bootstrap)]
+    again = [
+        _coupling([(entry.times, _drawn(entry.energies, draw)) for entry in data], unit)[0] for _ in range(bootstrap)
+    ]
     model = TriadModel(data[0].bands, density, coupling)
     if len(again) < 2:
         return TriadFit(model, torch.zeros_like(coupling), misfit)

@@ -34,7 +34,7 @@ from torchchain.network.modes import (
     softness,
 )
 from torchchain.network.networks import Network
-from torchchain.network.packing_bands import PackingBands, packing_band_energy, packing_bands
+from torchchain.network.packing_bands import PackingBands, band_starts, packing_band_energy, packing_bands
 from torchchain.network.packings import Packing, packing, rattlers, subnetwork, without_rattlers
 from torchchain.network.plane_waves import plane_wave
 from torchchain.network.spectra import (
@@ -76,6 +76,7 @@ __all__ = [
     "UnstableError",
     "Zone",
     "band_energy",
+    "band_starts",
     "band_waves",
     "begin",
     "bond_energy",

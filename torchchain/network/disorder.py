@@ -83,15 +83,18 @@ def diluted(network: Network, fraction: float, realizations: int | Iterable[int]
     _one(network)
     fraction = checks.number("fraction", fraction, at_least=0, at_most=1)
     numbers = _numbers(realizations)
-    keep = kept_bonds(network.n_bonds, fraction, numbers, seed).to(network.masses)
-    changes: dict[str, Any] = {
-        "masses": network.masses.expand(len(numbers), -1),
-        "stiffness": network.bond_stiffness * keep,
-    }
+    one_each = replace(network, masses=network.masses.expand(len(numbers), -1))
+    return without_bonds(one_each, kept_bonds(network.n_bonds, fraction, numbers, seed))
+
+
+def without_bonds(network: AnyNetwork, kept: Tensor) -> AnyNetwork:
+    """Networks without stiffness, tension and damping where ``kept``, of :func:`kept_bonds`, is 0."""
+    kept = kept.to(network.masses)
+    changes: dict[str, Any] = {"stiffness": network.bond_stiffness * kept}
     if network.is_prestressed:
-        changes["tension"] = network.bond_tension * keep
+        changes["tension"] = network.bond_tension * kept
     if network.is_damped:
-        changes["damping"] = network.bond_damping * keep
+        changes["damping"] = network.bond_damping * kept
     return replace(network, **changes)
 
 

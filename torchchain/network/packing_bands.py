@@ -5,13 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from scipy import special
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.chain import State
 from torchchain.chain.states import Trajectory
+from torchchain.network.disorder import uniform
 from torchchain.network.networks import Network
-from torchchain.network.wavenumber import POLARIZATIONS, box_wavevectors, plane_wave_energy, shell_energy
+from torchchain.network.wavenumber import POLARIZATIONS, box_wavevectors, plane_wave_energy, plane_waves, shell_energy
 
+_OTHER = 6  # the random stream of starts in the last band
 REACH = 2.0  # of the longest wavevector by default, over the mean bond length
 
 
@@ -122,3 +126,39 @@ def packing_band_energy(
     bad = ~((total[..., 0] > 0) & total[..., 0].isfinite())
     checks.first_bad("total energy", "be positive and finite to normalize", total[..., 0], bad, "time")
     return energy / total
+
+
+def band_starts(network: Network, bands: PackingBands, realization: int = 0, seed: int = 0) -> State:
+    """A displacement at rest in each band and in no other, (*batch, band, particle, component).
+
+    In a shell the wave of the wavevector nearest to its middle, the orthonormal one that
+    :func:`torchchain.network.plane_wave_energy` measures by; in the last band random displacements less all waves.
+
+    Args:
+        network: periodic along every direction.
+        bands: of :func:`packing_bands`.
+        realization, seed: of the random displacements.
+
+    Example:
+        >>> sheet = tc.network.displaced(tc.lattice("triangular", (8, 8)), 0.1)
+        >>> bands = tc.network.packing_bands(sheet, 1)
+        >>> still = tc.evolve(sheet, tc.network.band_starts(sheet, bands), [0.0], method="chebyshev")
+        >>> tc.network.packing_band_energy(sheet, still, bands)[:, 0].round(decimals=9).abs().tolist()
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    wavevectors = box_wavevectors(network, bands.largest)
+    basis, number, kind = plane_waves(network, wavevectors)
+    lengths = wavevectors.norm(dim=-1).cpu()
+    starts = []
+    for polarization in range(len(bands.polarizations)):
+        for low, high in zip(bands.edges[:-1], bands.edges[1:], strict=True):
+            off = (lengths - (low + high) / 2).abs()
+            chosen = int(torch.where(lengths > 0, off, torch.inf).argmin())
+            starts.append(basis[..., int(((number == chosen) & (kind == polarization)).nonzero()[0])])
+    n, c = network.n_particles, network.n_components
+    noise = torch.from_numpy(special.ndtri(uniform(n * c, realization, seed, _OTHER))).to(basis)
+    other = noise - (basis @ (basis.mT @ noise)[..., None])[..., 0]
+    starts.append(other / other.norm(dim=-1, keepdim=True))
+    field = torch.stack(starts, dim=-2).unflatten(-1, (n, c))
+    displacement = field * network.align(network.masses.rsqrt(), field)
+    return State(displacement, torch.zeros_like(displacement))

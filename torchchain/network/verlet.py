@@ -11,6 +11,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import State
 from torchchain.evolvers.method import Advance, Method
+from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network
 from torchchain.network.packings import Packing, contact_law, near_pairs
 from torchchain.network.trajectories import NetworkTrajectory
@@ -24,6 +25,7 @@ def start(network: Network, state: State, step: float | None = None, linear: boo
 
     Raises:
         FieldError: for a step at or beyond the stability limit, 2 / W.
+        UnstableError: for linear motion of a network that is not stable.
     """
     grains = isinstance(network, Packing) and not (linear is not None and checks.truth("linear", linear))
     if linear is False and not grains:
@@ -41,6 +43,7 @@ def start(network: Network, state: State, step: float | None = None, linear: boo
     if grains:
         assert isinstance(network, Packing)
         return _grains(network, state, step)
+    check_stability(network)  # linear motion would grow without limit
     return _linear(network, state, step)
 
 
