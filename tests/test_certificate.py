@@ -13,10 +13,10 @@ from torchchain.master.certificate import (
     CertificateError,
     Exponentials,
     certify,
-    nonnegative,
     verify,
 )
 from torchchain.master.memory import MemoryModel
+from torchchain.master.nonnegative import nonnegative
 
 EYE = torch.eye(2, dtype=torch.float64)
 

@@ -10,10 +10,11 @@ import torch
 
 from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master.certificate import CertificateError, certify, nonnegative
+from torchchain.master.certificate import CertificateError, certify
 from torchchain.master.fits import FitWarning
 from torchchain.master.memory import ORDERS, MemoryModel, ProjectionReport
 from torchchain.master.model import TransferModel
+from torchchain.master.nonnegative import nonnegative
 from torchchain.master.proof import Certificate
 from torchchain.master.records import Fitted, Progress, Recipe
 from torchchain.master.sample import Sample, decade_weights

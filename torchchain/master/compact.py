@@ -23,10 +23,11 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.master.certificate import CertificateError, nonnegative
+from torchchain.master.certificate import CertificateError
 from torchchain.master.loss import frequencies, mode_energy
 from torchchain.master.memory import ORDERS, MemoryModel, checked_order, fit_memory
 from torchchain.master.model import Embedding, TransferModel
+from torchchain.master.nonnegative import nonnegative
 from torchchain.master.proof import Certificate
 from torchchain.master.waves import Waves, first_odds
 
