@@ -63,7 +63,7 @@ def scene(config: Config, seed: int, species: tuple[Species, ...]) -> tc.Scene:
     return tc.Scene(
         n_particles=config.n_particles, n_bands=config.n_bands * len(species), species=species, by_species=True, seed=seed,
         realizations=config.realizations, disorder=tc.Disorder(config.kind, config.strength),
-        times=torch.arange(0, config.stop + 0.5, dtype=torch.float64),
+        times=torch.cat([torch.arange(0, 3, 0.25), torch.arange(3, config.stop + 0.5)]).double(),
     )  # fmt: skip
 
 
