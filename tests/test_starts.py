@@ -1,6 +1,7 @@
 """Any start: kicks from releases, energies by tone, the transfer of other starts, its model, and predictions against chains."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -453,3 +454,18 @@ def test_files_without_the_later_tensors_are_read(master, tmp_path):
     save_file(tensors | {"starts.rigid": torch.tensor(-0.1).double()}, tmp_path / "bad.safetensors", header)
     with pytest.raises(FieldError, match="starts.rigid must be a share of the energy"):
         tc.MasterEquation.load(tmp_path / "bad.safetensors")
+
+
+def test_the_command_measures_starts_or_not(tmp_path, monkeypatch, capsys):
+    from torchchain.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    small = ["--n-particles", "16", "--n-bands", "2", "--realizations", "16", "--times.stop", "4", *"--fit linear --model paper --bootstrap 0".split()]
+    assert main(["calibrate", *small, "--starts", "False", "--out", "bands"]) == 0
+    assert "starts = false" in Path("bands/config.toml").read_text()
+    assert tc.MasterEquation.load("bands/model.safetensors").starts is None
+    assert main(["calibrate", *small, "--out", "any"]) == 0
+    assert tc.MasterEquation.load("any/model.safetensors").starts is not None
+    seconds = [tc.open(run).record["forecast"].get("predicted_seconds") for run in ("bands", "any")]
+    assert None in seconds or seconds[1] > seconds[0]  # a method that no plan weighs has no forecast
+    capsys.readouterr()

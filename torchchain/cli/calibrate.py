@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import tomli_w
@@ -21,6 +22,7 @@ from torchchain.cli.runs import Run, config_of, merged_tables, running, scene_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.measured_transfer import band_transfer, measured_observables
 from torchchain.ensemble.scene_words import describe
+from torchchain.ensemble.starts import start_scene
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import Calibration, MasterEquation, calibrate
@@ -40,26 +42,31 @@ def run_calibrate(
     """
     config, loaded = config_of(flags.config, flags.plugin)
     settings = _settings(config.pop("calibration", {}), flags)
+    starts = checks.truth("starts", settings.pop("starts", True))
     if flags.transfer is not None:
         for name in {**config, **flags.overrides()}:
             raise checks.fail(name, "not be given together with transfer, which is of a scene already", repr(name))
         path, transfer = read_transfer(flags.transfer)
+        transfer = transfer if starts else replace(transfer, starts=None)
         recipe(transfer, **settings)
         shown = sources_of(flags.show, transfer.n_bands)
         with running(flags, arguments, loaded, options, keep=False) as run:
             source = {"transfer": {"path": str(path.resolve()), "sha256": outputs.sha256(path)}}
-            _leave(run, transfer, settings, None, source, shown)
+            _leave(run, transfer, settings, starts, None, source, shown)
         return
     scene = scene_of(config, flags)
     recipe(scene, **settings)  # before the ensemble is computed
     shown = sources_of(flags.show, scene.n_bands)
     with running(flags, arguments, loaded, options, keep) as run:
-        found = run.measured(band_transfer, scene)
+        found = run.measured(partial(band_transfer, starts=starts), scene)
         if found is not None:
             assert found.scene is not None, "of a simulation"
             ensemble = replace(found.scene, observables=measured_observables(found.scene))
             forecast = planning.forecast(ensemble, found.attributes, run.spent, float(found.stderr.max()))
-            _leave(run, found, settings, forecast, run.how(ensemble, found.attributes), shown)
+            if found.starts is not None and "predicted_seconds" in forecast:
+                more = planning.forecast(start_scene(found.scene), found.attributes, 0.0, 0.0)
+                forecast["predicted_seconds"] += more["predicted_seconds"]
+            _leave(run, found, settings, starts, forecast, run.how(ensemble, found.attributes), shown)
 
 
 def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:
@@ -68,7 +75,7 @@ def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:
         raise checks.FieldTypeError(f"calibration must be a table, got {checks.shown(table)}")
     settings = merged_tables(table, flags.calibration())
     fits = [name for fit in methods().values() for name in fit.settings_names]
-    checks.known_keys("calibration", settings, ("method", "model", "window", "bootstrap", *dict.fromkeys(fits)))
+    checks.known_keys("calibration", settings, ("method", "model", "window", "bootstrap", "starts", *dict.fromkeys(fits)))
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])
@@ -76,8 +83,8 @@ def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:
 
 
 def _leave(
-    run: Run, transfer: BandTransfer, settings: dict[str, Any], forecast: dict[str, Any] | None, source: dict[str, Any],
-    shown: Sequence[int],
+    run: Run, transfer: BandTransfer, settings: dict[str, Any], starts: bool, forecast: dict[str, Any] | None,
+    source: dict[str, Any], shown: Sequence[int],
 ) -> None:  # fmt: skip
     """Fit, predict, compare, draw, write and tell."""
     stages = run.stages
@@ -96,6 +103,7 @@ def _leave(
             figure = calibration_figure(transfer, master, predicted, rates, shown)
     done = fitted(master)
     chosen = {**settings, "method": done.method, "model": done.model, "window": list(done.window or ())}
+    chosen |= {} if starts else {"starts": False}
     scene = [] if transfer.scene is None or "transfer" in source else [transfer.scene.to_toml()]
     seed = None if transfer.scene is None else transfer.scene.seed
     files = {

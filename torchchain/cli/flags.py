@@ -163,6 +163,8 @@ class Calibrate(RunFlags):
     """adam: weight of the conservation penalty"""
     bootstrap: Annotated[int | None, flag("INT", "20, or none where fits take long")] = None
     """ensembles drawn again for the error bars, 0 for none"""
+    starts: Annotated[bool | None, flag(("True", "False"), True)] = None
+    """also measure kicks and other tones, for a model that takes any start in space; not more than the rest of the ensemble costs"""
     show: Annotated[str | None, flag("INT,INT", "10,23 of 32 bands")] = None
     """source bands of the figure"""
     out: Annotated[str, flag("FOLDER", "results/calibrate")] = "results/calibrate"
@@ -176,7 +178,7 @@ class Calibrate(RunFlags):
         return {name: value for name, value in held.items() if value is not None}
 
 
-_FIT = ("model", "window", "constraint", "penalty", "bootstrap")
+_FIT = ("model", "window", "constraint", "penalty", "bootstrap", "starts")
 
 
 @dataclass(frozen=True)

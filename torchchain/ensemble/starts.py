@@ -153,6 +153,16 @@ def measurable(scene: Scene) -> bool:
     return linear and scene.distinct_realizations // scene.sample_size >= FEWEST
 
 
+def start_scene(scene: Scene) -> Scene:
+    """The ensemble of the other starts of a scene with standing waves."""
+    assert isinstance(scene.excitation, StandingWave), "transfers come from standing waves"
+    return replace(
+        scene, realizations=scene.distinct_realizations, times=start_times(scene.times),
+        observables=("band_energy", "kicked_band_energy"),
+        excitation=replace(scene.excitation, tones=start_tones(scene), phase="cos"),  # the sine of tone N/2 is none
+    )  # fmt: skip
+
+
 def start_transfer(
     scene: Scene, method: str, options: dict[str, Any], checkpoint: Checkpoint | None, **settings: Any
 ) -> StartTransfer:
@@ -164,18 +174,13 @@ def start_transfer(
         checkpoint: of this run alone.
         settings: the rest of :func:`torchchain.ensemble.run.ensemble_moments`.
     """
-    count = scene.distinct_realizations
-    assert isinstance(scene.excitation, StandingWave), "transfers come from standing waves"
-    other = replace(
-        scene, realizations=count, times=start_times(scene.times), observables=("band_energy", "kicked_band_energy"),
-        excitation=replace(scene.excitation, tones=start_tones(scene), phase="cos"),  # the sine of tone N/2 is none
-    )  # fmt: skip
+    other = start_scene(scene)
     moments = ensemble_moments(other, method, 1, options=options, checkpoint=checkpoint, **settings).moments
     found: dict[str, Tensor] = {}
     for kind, name in zip(KINDS, other.observables, strict=True):
         total = merged(moments.blocks(name))
         found[kind], found[f"{kind}_stderr"] = _rounded(total.mean, ordered_error(scene.is_ordered, total))
-    return StartTransfer(start_tones(scene), other.times, samples=count // scene.sample_size, **found)
+    return StartTransfer(start_tones(scene), other.times, samples=other.realizations // scene.sample_size, **found)
 
 
 def _rounded(mean: Tensor, stderr: Tensor) -> tuple[Tensor, Tensor]:
