@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from dataclasses import dataclass
+from itertools import cycle
 
 import harness
 import numpy as np
@@ -219,8 +220,10 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     )  # fmt: skip
     for i, panel in ((0, axes[2]), (len(config.tests) - 1, axes[3])):
         ax, chains, model = panel, data[f"chains_{i}"][0], data[f"triads_energy_{i}"][0]
-        for j in range(0, config.n_bands, max(1, config.n_bands // 6)):
-            (line,) = ax.plot(data.slow_time, chains[:, j], label=f"band {j + 1}")
+        for j, marker in zip(range(0, config.n_bands, max(1, config.n_bands // 6)), cycle("osD^vx"), strict=False):
+            (line,) = ax.plot(
+                data.slow_time, chains[:, j], "-", marker=marker, ms=3, markevery=(j, 8), label=f"band {j + 1}"
+            )
             ax.fill_between(
                 data.slow_time,
                 *(chains[:, j] + s * data[f"chains_stderr_{i}"][0, :, j] for s in (-1, 1)),
