@@ -251,10 +251,10 @@ FLAGS = [
     ("--disorder.lower -0.1", "disorder.lower must be at least 0"),
     ("--disorder.kind binary --disorder.strength 0.99", "disorder.strength must be less than 1 - lower"),
     ("--excitation.kind kick", "excitation.kind must be one of impulse, standing_wave, got 'kick'"),
-    ("--excitation.site 3", "excitation must have only the keys tones, amplitude, phase, got 'site'"),
+    ("--excitation.site 3", "excitation.kind must be 'impulse' for excitation.site, got 'standing_wave'"),
     (
         "--excitation.kind impulse --excitation.tones 1",
-        "excitation must have only the keys site, velocity, got 'tones'",
+        "excitation.kind must be 'standing_wave' for excitation.tones, got 'impulse'",
     ),
     ("--excitation.kind impulse --excitation.site 0", "excitation.site must be at least 1, got 0"),
     ("--excitation.kind impulse --excitation.site 33", "excitation.site must be at most 32, got 33"),

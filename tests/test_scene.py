@@ -183,7 +183,7 @@ def test_bad_fields(fields, error, message):
         ("[excitation]\nkind = 3", "excitation.kind must be a string"),
         (
             "[excitation]\nkind = 'impulse'\ntones = [1]",
-            "excitation must have only the keys site, velocity, got 'tones'",
+            "excitation.kind must be 'standing_wave' for excitation.tones, got 'impulse'",
         ),
         ("[excitation]\ntones = 'all'", "excitation.tones must be a list of integers"),
         ("[excitation]\ntones = [true]", "excitation.tones must be an integer, got True"),

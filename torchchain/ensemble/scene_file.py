@@ -66,6 +66,10 @@ def fields_of(plain: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     if "excitation" in fields:
         table = _table("excitation", fields["excitation"])
         kind = checks.choice("excitation.kind", table.pop("kind", "standing_wave"), EXCITATIONS)
+        owner = {entry.name: other for other, record in EXCITATIONS.items() for entry in dataclasses.fields(record)}
+        for name in table:
+            if owner.get(name, kind) != kind:
+                raise checks.fail("excitation.kind", f"be {owner[name]!r} for excitation.{name}", repr(kind))
         fields["excitation"] = _from_table("excitation", table, EXCITATIONS[kind])
     if isinstance(fields.get("times"), Mapping):
         fields["times"] = _times_from_table(fields["times"])

@@ -49,16 +49,11 @@ def network(
                 "be in the file for a network of contacts, or contact lists with it (a chain: name its axis)",
                 "none",
             )
-        return packing(
-            reference.positions,
-            radii,
-            masses,
-            box,
-            checks.number("stiffness", stiffness, above=0),
-            contact,
-            damping,
-            prestress,
-        )
+        modulus = checks.number("stiffness", stiffness, above=0)
+        try:
+            return packing(reference.positions, radii, masses, box, modulus, contact, damping, prestress)
+        except checks.FieldError as error:
+            raise checks.FieldError(f"{here(name, reference)}: {error}") from None
     rested = _between_grains(name, rested)
     force, slope = _laws(name, rested, stiffness, contact, prestress)
     assert rested.contacts is not None

@@ -173,7 +173,9 @@ def calibrate(
             fitted, told, proof = certified(
                 transfer, asked, (fitted, told), report.selection is not None, shown.update, other is not None
             )
-            if proof is None and other is not None:  # nothing that may be negative is handed out where another can be had
+            if (
+                proof is None and other is not None
+            ):  # nothing that may be negative is handed out where another can be had
                 asked = other
                 fitted, told = asked.run(sample, None, shown.update)
                 free = fitted

@@ -143,7 +143,9 @@ def nearest_sure(asked: Recipe, selection: Selection) -> Recipe | None:
     rung = min(sure, key=lambda each: each.distance)
     record = MODELS[rung.model]
     fit = record.fit(record.climbed_by or "")
-    settings = next(s for s in record.rungs(MANY) if replace(asked, model=record, fit=fit, settings=s).order == rung.order)
+    settings = next(
+        s for s in record.rungs(MANY) if replace(asked, model=record, fit=fit, settings=s).order == rung.order
+    )
     return replace(asked, model=record, fit=fit, settings=settings)
 
 

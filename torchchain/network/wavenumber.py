@@ -182,7 +182,8 @@ def box_wavevectors(network: Network, largest: float) -> Tensor:
     """
     largest = checks.number("largest wavenumber", largest, at_least=0)
     if network.cell is None:
-        raise checks.fail("box", "be periodic along every direction for plane waves", network.box)
+        box = None if network.box is None else network.box.tolist()
+        raise checks.fail("box", "be periodic along every direction for plane waves", box)
     cell = network.cell.detach().double().cpu().numpy()
     vectors = 2 * math.pi * np.linalg.inv(cell).T
     reach = [int(largest * np.linalg.norm(row) / (2 * math.pi)) + 1 for row in cell]
