@@ -5,7 +5,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.theory import fit_disorder, theory_transfer
+from torchchain.theory import fit_disorder, theory_transfer, transfer_at
 
 TIMES = torch.arange(0, 31, 3, dtype=torch.float64)
 TONE, BAND = 22, 5
@@ -44,3 +44,39 @@ def test_a_transfer_of_its_own_is_recovered():
 def test_energies_of_another_shape_are_refused(shape):
     with pytest.raises(FieldError, match="energies must have shape"):
         fit_disorder(TIMES, torch.ones(shape), 64, 8, tones=[TONE])
+
+
+def test_transfer_has_derivatives_in_strength_and_damping():
+    strength, damping = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (0.2, 0.01))
+    share = transfer_at(strength, 32, 4, [2.0, 4.0], damping)[2]
+    weight = torch.tensor([[0.0, 1.0, 2.0, -1.0], [1.0, 0.0, 1.0, 3.0]], dtype=torch.float64)
+    (weight * share.square()).sum().backward()
+
+    def loss(xi, rate):
+        return float(
+            (weight * theory_transfer(tc.Disorder(strength=xi), 32, 4, [2.0, 4.0], damping=rate).mean[2].square()).sum()
+        )
+
+    # Richardson's fourth-order differences at other steps
+    for found, function in (
+        (strength.grad, lambda h: loss(0.2 + h, 0.01)),
+        (damping.grad, lambda h: loss(0.2, 0.01 + h)),
+    ):
+        wide, narrow = ((function(h) - function(-h)) / (2 * h) for h in (0.004, 0.002))
+        assert float(found) == pytest.approx((4 * narrow - wide) / 3, rel=2e-4)
+
+
+def test_newton_steps_with_the_derivative_find_the_strength():
+    exact = theory_transfer(tc.Disorder(strength=0.25), 32, 4, [2.0, 4.0]).mean
+    strength = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    for _ in range(3):
+        share = transfer_at(strength, 32, 4, [2.0, 4.0])[2, :, 2]
+        slope = torch.autograd.grad(share.sum(), strength)[0]
+        with torch.no_grad():
+            strength += (exact[2, :, 2] - share).sum() / slope
+    assert float(strength.detach()) == pytest.approx(0.25, rel=1e-5)
+
+
+def test_derivatives_want_scalars():
+    with pytest.raises(FieldError, match="strength must be a scalar"):
+        transfer_at(torch.ones(2), 32, 4, [1.0])

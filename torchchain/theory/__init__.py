@@ -1,5 +1,6 @@
 """Band energies from the theory of disorder, without chains (docs/theory.md)."""
 
+from torchchain.theory.derivative import transfer_at
 from torchchain.theory.fit import DisorderFit, fit_disorder
 from torchchain.theory.lattices import lattice_transfer
 from torchchain.theory.law import Law, law_of
@@ -20,4 +21,5 @@ __all__ = [
     "lattice_transfer",
     "law_of",
     "theory_transfer",
+    "transfer_at",
 ]
