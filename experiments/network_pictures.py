@@ -165,7 +165,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     for i, t in enumerate(data.instant.values):
         drawn = disks(axes[0, i], data, data.snap.values[i])
         axes[0, i].set_title(f"disks, t = {t:g}")
-    figure.colorbar(drawn, ax=axes[0, n - 1], label="energy$^{1/4}$")
+    figure.colorbar(drawn, ax=list(axes[0]), aspect=15, label="(energy / kick's unit)$^{1/4}$")
     axis = axes[1, 0]
     image = axis.pcolormesh(
         data.time, data.edges, data.shells.sum("polarization").values[:-1].T, cmap="viridis", vmax=0.2
@@ -178,10 +178,14 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         )
         q = np.linspace(0, float(data.q[-1]), 200)
         law = 3 - 2 * np.cos(q) - np.cos(q / 2) if p == 0 else 3 * (1 - np.cos(q / 2))
-        axis.plot(q, np.sqrt(law), "w--", lw=1, label="ordered lattice")
-        axis.legend(loc="lower right")
-        axis.set(xlabel="$q$ along a bond", ylabel=r"$\omega$", title=rf"{name} $S(q, \omega)$, $\xi$ = {config.strength:g}")
-        figure.colorbar(image, ax=axis, label="log10 S")
+        axis.plot(q, np.sqrt(law), "w--", lw=1)
+        axis.set(
+            xlabel="$q$ along a bond",
+            ylabel=r"$\omega$",
+            title=rf"{name} $S(q, \omega)$, $\xi$ = {config.strength:g}" + "\n(dashed: ordered lattice)",
+            xlim=(float(data.q[0]), float(data.q[-1])),
+        )
+        figure.colorbar(image, ax=axis, label=r"$\log_{10} S$")
     return figure
 
 

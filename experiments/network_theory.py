@@ -88,9 +88,9 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         for i, strength in enumerate(data.strength.values):
             line = data.sel(lattice=kind, strength=strength).isel(time=slice(1, None))
             axis.plot(line.time, line.theory, color=f"C{i}", label=rf"$\xi$ = {strength:g}")
-            axis.plot(line.time, line.ensembles, ":", color=f"C{i}")
+            axis.plot(line.time, line.ensembles, ".", ms=2.5, color=f"C{i}")
         axis.set(xscale="log", yscale="log", xlabel="t", ylabel="total variation", title=f"{kind}, scalar")
-        axis.legend(fontsize="small", title="theory (dotted: two ensembles)", title_fontsize="small")
+        axis.legend(fontsize="small", title="lines: theory; dots: two ensembles", title_fontsize="small")
     return figure
 
 
