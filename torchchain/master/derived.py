@@ -381,12 +381,12 @@ THEORY = ReducedModel(
     "theory", "the theory of disorder: no fitted number, and no ensemble", TheoryModel,
     (Fit("derivation", "from the law of the masses", _derive),), lambda n_bands, damped, settings: 0,
     climbed_by="derivation", needs_strength=True, fits_loss=True, check_scene=check_scene, tried_on=compared, windows=(1.0, 5.0, 50.0),
-    near=NEAREST, never_negative=True, replicas=_same,
+    near=NEAREST, never_negative=True, slow=True, replicas=_same,
 )  # fmt: skip
 CORRECTED = ReducedModel(
     "corrected_theory", "the theory times exponentials of polynomials: some tens of numbers, never negative", TheoryModel,
     (Fit("correction", "logistic regression on all times", _correct, settings=CompactSettings, report=CompactReport),),
     lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="correction",
     needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_corrected, tried_on=compared, windows=(1.0, 5.0, 50.0),
-    near=NEAREST, never_negative=True, replicas=_again,
+    near=NEAREST, never_negative=True, slow=True, replicas=_again,
 )  # fmt: skip

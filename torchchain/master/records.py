@@ -91,6 +91,7 @@ class ReducedModel:
         near: distance from fresh chains over that of two ensembles, up to which it will do in each window.
         never_negative: whether its energies are never negative by its form. Of damped chains, whose energies no
             certificate covers, selection tries no other model where such a one describes them.
+        slow: whether a prediction takes the better part of a second: of models as good, selection takes one that is not.
         replicas: ``replicas(transfer, recipe, model, repeats)`` -> the models of ensembles in which the blocks are
             repeated, (replica, block), where that is quicker than to fit each from its energies.
 
@@ -118,6 +119,7 @@ class ReducedModel:
     windows: tuple[float, ...] = ()
     near: float = 1.25
     never_negative: bool = False
+    slow: bool = False
     replicas: Callable[[BandTransfer, Recipe, Any, Tensor], Iterator[TransferModel]] | None = None
 
     def __post_init__(self) -> None:

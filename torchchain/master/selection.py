@@ -65,8 +65,8 @@ def select(
 
     As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time will do if,
     fitted to all blocks, it is foreseen to be within ``near`` times the noise in every one, and is taken if no larger
-    one of its like is foreseen to be nearer by more than a tenth. If none will do, the nearest is taken. Models with
-    rates are tried with procedure L.
+    one of its like is foreseen to be nearer by more than a tenth, nor one as near that predicts faster. If none will do,
+    the nearest is taken. Models with rates are tried with procedure L.
 
     Returns:
         The recipe of the rung, what was tried, and the model fitted to half of the blocks.
@@ -127,7 +127,8 @@ def select(
         assert refused is not None, "there is at least one candidate"
         raise refused
     if enough:
-        best = min(i for i, distance in enough.items() if distance <= AS_GOOD * min(enough.values()))
+        good = [i for i, distance in enough.items() if distance <= AS_GOOD * min(enough.values())]
+        best = min(good, key=lambda i: (MODELS[tried[i].model].slow, i))
     else:
         best = min(range(len(tried)), key=lambda i: tried[i].distance)
     reached = "reaches" if enough else "comes nearest to"
