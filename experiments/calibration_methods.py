@@ -220,7 +220,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
     lines += [
         "Where gradients are the right tool: rates that depend on amplitude, from bands of wavenumber at two times. Couplings show only in where trajectories end; without "
         "the modes of\nevery chain no equation is linear in them, and differences need a solution for each coupling. L-BFGS by the same gradients comes as near as Adam.",
-        "Where they are not: with the modes known the equations are linear in the couplings; constant rates, and rates in time, need thousands of numbers and stay behind "
+        "Where they are not: with the modes of every chain known linear least squares takes a hundredth of the time; constant rates, and rates in time, need thousands of numbers and stay behind "
         "odds that\nlogistic regression fits.",
     ]
     if growing:

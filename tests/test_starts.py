@@ -469,3 +469,25 @@ def test_the_command_measures_starts_or_not(tmp_path, monkeypatch, capsys):
     seconds = [tc.open(run).record["forecast"].get("predicted_seconds") for run in ("bands", "any")]
     assert None in seconds or seconds[1] > seconds[0]  # a method that no plan weighs has no forecast
     capsys.readouterr()
+
+
+def test_a_family_takes_any_start_between_its_members_and_tells_below_them():
+    def small(strength, seed=0, count=60):
+        kind = {"n_particles": 32, "n_bands": 4, "times": [0.0, 0.5, 1.0, 1.5, 2.0, 4.0, 8.0, 20.0]}
+        return scene(**kind, realizations=count, seed=seed, disorder=tc.Disorder(strength=strength))
+
+    transfers = [tc.band_transfer(small(strength), "modes") for strength in (0.2, 0.4)]
+    family = tc.calibrate_family(transfers, bootstrap=0)
+    found = family.at(0.3)
+    fresh = tc.band_transfer(small(0.3, seed=5, count=200), "modes").starts
+    for kind in ("released", "kicked"):
+        told = found.starts.transfer(kind, fresh.tones, fresh.times)
+        measured, noise = (getattr(fresh, name)[:, 1:] for name in (kind, f"{kind}_stderr"))
+        off = {m: float(tc.total_variation(m.starts.transfer(kind, fresh.tones, fresh.times)[:, 1:], measured).mean()) for m in family.members}
+        here = float(tc.total_variation(told[:, 1:], measured).mean())
+        assert here < min(off.values()) / 2  # nearer than either neighbor
+        assert here < 3 * float(tc.statistical_distance(noise).mean())
+    assert found.solve(tc.Impulse(), [0.0, 9.0]).shape == (2, 4)
+    assert family.at(0.1).starts is None
+    with pytest.warns(tc.TrustWarning, match="calibrated without other starts"):
+        family.at(0.1).solve(tc.Impulse(), [1.0])

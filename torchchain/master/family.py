@@ -27,6 +27,8 @@ from torchchain.master.compact_record import COMPACT, CompactReport
 from torchchain.master.equation import MasterEquation
 from torchchain.master.memory import MemoryModel
 from torchchain.master.report import Loss, Report
+from torchchain.master.starts import StartModel, can_fit, fit_starts, with_errors
+from torchchain.master.starts import between as between_starts
 from torchchain.master.uncertainty import Uncertainty
 
 NEIGHBORS = 4
@@ -143,7 +145,7 @@ class MasterFamily(Printed):
         }  # fmt: skip
 
     def at(self, strength: float) -> MasterEquation:
-        """The master equation at a strength from 0 to the largest calibrated.
+        """The master equation at a strength from 0 to the largest calibrated; of any start only from the lowest on.
 
         Raises:
             FieldError: for a larger one.
@@ -152,12 +154,28 @@ class MasterFamily(Printed):
         chosen = dict(zip(self.strengths, self.members, strict=True))
         if len(weights) == 1:  # a member's own strength
             return chosen[next(iter(weights))]
+        found = self._joined(float(strength), weights)
+        found.starts = self._starts(scene_of(found))
+        return found
+
+    def _starts(self, scene: Scene) -> StartModel | None:
+        """The model of starts in space from the members on either side; none below the lowest, where it was far off."""
+        known, strength = self.strengths, scene.disorder.strength
+        above = sum(xi <= strength for xi in known)
+        if above == 0 or above == len(known):
+            return None
+        (low, first), (high, last) = ((known[i], self.members[i].starts) for i in (above - 1, above))
+        return None if first is None or last is None else between_starts((low, first), (high, last), scene)
+
+    def _joined(self, strength: float, weights: dict[float, float]) -> MasterEquation:
+        """At a strength that no member has."""
+        chosen = dict(zip(self.strengths, self.members, strict=True))
         if self._sets:
-            return self._between(float(strength), weights)
+            return self._between(strength, weights)
         parts = [(w, chosen[xi]) for xi, w in weights.items() if xi in chosen]
         record = parts[0][1].calibration
         scene = scene_of(parts[0][1])
-        scene = replace(scene, disorder=replace(scene.disorder, strength=float(strength)))
+        scene = replace(scene, disorder=replace(scene.disorder, strength=strength))
         losses = [(w, m.calibration.report.loss) for w, m in parts]
         report = Report(
             interpolated=tuple(weights.items()),
@@ -263,7 +281,13 @@ def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> Mast
     checks.known_keys("settings", settings, ("degrees", "window", "bootstrap"))
     asked = [recipe(transfer, "logistic", "compact", window=settings.get("window")) for transfer in transfers]
     counts = [replicates(settings.get("bootstrap"), asked[0].fit, transfer) for transfer in transfers]
-    return MasterFamily(calibrate_together(transfers, asked[0].window, min(counts), settings.get("degrees")))
+    members = calibrate_together(transfers, asked[0].window, min(counts), settings.get("degrees"))
+    for transfer, member in zip(transfers, members, strict=True):
+        if can_fit(transfer):
+            starts = fit_starts(transfer)
+            errors = member.uncertainty
+            member.starts = starts if errors is None else with_errors(starts, transfer, errors)
+    return MasterFamily(members)
 
 
 def _combined(parts: Sequence[tuple[float, MasterEquation]], idle: float) -> MemoryModel:

@@ -22,13 +22,14 @@ from torch import Tensor, nn
 
 from torchchain import checks
 from torchchain.energy.start_energy import StartEnergy
+from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.starts import KINDS
 from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.compact import checked_degrees, n_coefficients
 from torchchain.master.logistic import BEYOND, chosen_times, solve
 from torchchain.master.misfit import model_error
-from torchchain.master.tones import ToneRegression, Tones, shares
+from torchchain.master.tones import ONSET, ToneRegression, Tones, shares
 from torchchain.master.uncertainty import Uncertainty
 from torchchain.threads import single_blas_thread
 
@@ -229,9 +230,7 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
     scene, starts = transfer.scene, transfer.starts
     assert scene is not None, "can_fit has said so"
     assert starts is not None, "and so"
-    other = scene.stiffness_disorder
-    strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
-    tones = Tones.of(scene.n_particles, scene.n_bands, strength, scene.disorder.strength)
+    tones = _tones(scene)
     degrees = (*DEGREES[:2], max(2, min(DEGREES[2], (len(starts.times) - 1) // 2)))
     numbers, own = (torch.tensor(found) - 1 for found in (starts.tones, scene.tones))
     later = starts.times > 0
@@ -267,6 +266,35 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
         coupling=tones.coupling, scale_times=none, scale=none.expand(2, 2, 0), n_bands=scene.n_bands, rigid=tones.rigid,
         onset=tones.onset,
     )  # fmt: skip
+
+
+def _tones(scene: Scene) -> Tones:
+    other = scene.stiffness_disorder
+    strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
+    return Tones.of(scene.n_particles, scene.n_bands, strength, scene.disorder.strength)
+
+
+def between(lower: tuple[float, StartModel], upper: tuple[float, StartModel], scene: Scene) -> StartModel | None:
+    """The model of a scene whose disorder lies between those of two models.
+
+    What is fitted changes linearly with the logarithm of the strength. Errors are the larger of both.
+
+    Args:
+        lower, upper: strength and model.
+        scene: its masses and contacts, of a strength between.
+
+    Returns:
+        None for models of different forms.
+    """
+    (low, first), (high, last) = lower, upper
+    known = {float(model.get_buffer("onset")) for model in (first, last)} == {ONSET}
+    if first.degrees != last.degrees or not torch.equal(first.scale_times, last.scale_times) or not known:
+        return None
+    part, tones = math.log(scene.disorder.strength / low) / math.log(high / low), _tones(scene)
+    mixed = {kind: torch.lerp(getattr(first, kind), getattr(last, kind), part) for kind in KINDS}
+    own = {name: getattr(tones, name) for name in ("frequency", "decay", "coupling", "rigid", "onset")}
+    scale = torch.maximum(first.scale, last.scale)
+    return StartModel(**first.tensors() | mixed | own | {"scale": scale}, n_bands=first.n_bands)
 
 
 def _in_bands(mean: Tensor) -> Tensor:
