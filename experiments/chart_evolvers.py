@@ -307,7 +307,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     handles = [axes[0, 0].plot([], [], label=name, markersize=4, **_look(name))[0] for name in shown]
     handles.append(axes[0, 0].plot([], [], "0.3", linestyle=":", label="float32")[0])
     handles.append(axes[0, 0].plot([], [], "k", linestyle="--", linewidth=0.8, label="reference's own error")[0])
-    figure.legend(handles=handles, loc="outside lower center", ncols=5)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3 if columns == 1 else 5)
     return figure
 
 

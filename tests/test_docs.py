@@ -61,3 +61,11 @@ def test_readme_tells_every_word_where_it_first_appears():
         place = text.find(word)
         assert place > -1
         assert meaning in text[max(0, place - 200) : place + 300], word
+
+
+def test_every_experiment_has_its_figure_and_numbers_in_the_gallery():
+    kept = {path.name for path in (ROOT / "docs" / "gallery").iterdir()}
+    hidden = re.search(r"^HIDDEN = \((.*)\)$", (ROOT / "docs" / "_ext" / "pages.py").read_text(encoding="utf-8"), re.M)[1]
+    for path in (ROOT / "experiments").glob("*.py"):
+        if f'"{path.stem}"' not in hidden:
+            assert {f"{path.stem}.png", f"{path.stem}.txt"} <= kept, path.stem

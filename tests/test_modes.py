@@ -29,7 +29,7 @@ def test_kick_of_the_infinite_chain():
     bessel = special.jv(2 * np.abs(offset), 2 * times[:, None])
     np.testing.assert_allclose(moved.velocity.numpy(), v0 * bessel, atol=1e-13 * v0)
     # and the displacement is its integral; at the site itself int_0^t J_0(2 s) ds
-    center = special.itj0y0(2 * times)[0] / 2
+    center = special.jv(2 * np.arange(200) + 1, 2 * times[:, None]).sum(-1)  # int_0^x J_0 = 2 sum of J_1, J_3, ...
     np.testing.assert_allclose(moved.displacement[:, site - 1].numpy(), v0 * center, atol=1e-10 * v0)
 
 

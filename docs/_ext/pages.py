@@ -40,8 +40,11 @@ def write_experiments(root: Path, target: Path) -> None:
         body = text.split('"""', 2)[2].lstrip("\n")
         head, _, tail = words.partition(": ")
         title, more = (f"{head}: {tail.split(',')[0].rstrip('.')}" if head.startswith("Fig. ") else path.stem), words
+        title = title.replace("^2", "²")
         picture, report = root / "docs" / "gallery" / f"{path.stem}.png", root / "docs" / "gallery" / f"{path.stem}.txt"
         lines = [title, "=" * (len(title) + 2), "", plain(more), "", f"Run it: ``python experiments/{path.stem}.py``"]
+        if report.is_file() and (made := report.read_text(encoding="utf-8").splitlines()[0]).startswith("$ "):
+            lines += ["", f"Figure and numbers below are those of a smaller run, ``{made[2:]}``; the full run's are in the tables of :doc:`/experiments`."]
         group = target / ("1_paper" if path.stem.startswith(PAPER) else "2_charts")
         thumbnail = ""
         if picture.is_file():
