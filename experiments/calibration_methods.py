@@ -153,6 +153,7 @@ def _costs(ax: Axes, data: xarray.Dataset) -> None:
            xscale="log", yscale="log", title="(b) error and cost")  # fmt: skip
     for label in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
         label("{x:g}")
+    ax.xaxis.set_minor_formatter("")
 
 
 def _gradients(ax: Axes, data: xarray.Dataset) -> None:
