@@ -79,8 +79,8 @@ def wrapped_labels(figure: Any) -> None:
             continue
         shape = where.get_gridspec()
         for label, room in (
-            (ax.yaxis.label, 0.75 * figure.get_figheight() / shape.nrows),
-            (ax.title if ax.get_title() else ax._left_title, 0.95 * figure.get_figwidth() / shape.ncols),
+            (ax.yaxis.label, 0.75 * figure.get_figheight() * len(where.rowspan) / shape.nrows),
+            (ax.title if ax.get_title() else ax._left_title, 0.95 * figure.get_figwidth() * len(where.colspan) / shape.ncols),
         ):
             text, most = label.get_text(), int(room / CHARACTER)
             if len(text) > most and not set("$\n") & set(text):
