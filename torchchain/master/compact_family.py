@@ -52,6 +52,9 @@ THEORY_ERROR = 0.3
 WEAKEST = 1e-9
 """In place of no disorder, where nothing moves."""
 
+THEORY_WEAKEST = 1e-3
+"""Weakest disorder of which the theory is asked for coefficients: the energy that leaves a band, some xi^2, nears rounding."""
+
 
 def polynomials_of(strengths: Sequence[float], known: Sequence[float], sets: int) -> np.ndarray:
     """Chebyshev's polynomials in sqrt(xi) from the lowest to the highest known strength, (strength, set).
@@ -92,8 +95,12 @@ def between(members: Sequence[MasterEquation], scene: Scene, sets: int, power: i
     mixed = {name: summed(name, near) for name in ("rates", "loss")}
     mixed["coefficients"] = summed("coefficients", weights(strength, known, sets).tolist())
     if strength < known[0]:
-        lowest = replace(scene, disorder=replace(scene.disorder, strength=known[0]))
-        here, there = (_told_by_theory(each, tensors[0]["degrees"]) for each in (scene, lowest))
+        told = max(strength, THEORY_WEAKEST)
+        here, there = (
+            _told_by_theory(replace(scene, disorder=replace(scene.disorder, strength=xi)), tensors[0]["degrees"])
+            for xi in (told, known[0])
+        )
+        here = here * (strength / told) ** power
         share = ((strength**2 + beside**2) / (known[0] ** 2 + beside**2)) ** (power / 2)
         mixed["coefficients"] = here + share * (mixed["coefficients"] - there)
     return CompactModel(**tensors[0] | mixed | waves.tensors())

@@ -101,7 +101,8 @@ class Network:
         put("bond_vectors", self._bond_vectors())
         lengths = self.bond_vectors.square().sum(-1).sqrt()
         scale = torch.finfo(masses.dtype).eps * max(float(self.points.detach().abs().max()), 1e-300)
-        checks.first_bad("length of bonds", "be positive", lengths, lengths <= scale, "bond")
+        what = "length of bonds" if self.box is None else "length of bonds in the periodic box"
+        checks.first_bad(what, "be positive", lengths, lengths <= scale, "bond")
         put("lengths", lengths)
         put("directions", self.bond_vectors / lengths[:, None])
         if self.box is not None and self.images is None:
