@@ -179,8 +179,8 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         axes[1, 0].plot(t[1:], data.error.isel(way=1, strength=i)[1:], "--", color=f"C{i}", lw=0.8)
         axes[1, 0].plot(t[1:], data.noise.isel(strength=i)[1:], ":", color=f"C{i}", lw=0.8)
     band = band_of(config.tone, config.n_particles, config.n_bands)
-    axes[0, 2].set(xlabel=plots.TIME_LABEL, ylabel="share of the energy left in the source band", ylim=(0, 1.02),
-                   title=f"band {band}: theory (lines), chains (points, 2 s.e.)")  # fmt: skip
+    axes[0, 2].set(xlabel=plots.TIME_LABEL, ylabel="share left in it", ylim=(0, 1.02),
+                   title=f"band {band}; points: chains")  # fmt: skip
     axes[0, 2].legend(fontsize=8)
     axes[1, 0].set(xscale="log", yscale="log", xlabel=plots.TIME_LABEL, ylabel="mean total variation from chains", ylim=(1e-5, 0.2),
                    title="theory (lines), ladder alone (dashed), noise (dotted)")  # fmt: skip
@@ -240,7 +240,7 @@ def _draw_edges(ax: Axes, data: xarray.Dataset, config: Config) -> None:
         if smooth.max() > FAILS > smooth.min() and min(smooth.shape) > 1:
             ax.contour(later.time, later.source, smooth.T, [FAILS], colors=f"C{i}", linestyles=STYLES[i % len(STYLES)])
     ax.set(xscale="log", xlabel=plots.TIME_LABEL, ylabel="source band", xlim=(config.step, config.stop), ylim=(1, config.n_bands + 1),
-           title=f"where the theory fails: total variation\nof a source above {FAILS:g} inside the lines")  # fmt: skip
+           title=f"off by {FAILS:g} inside the lines")  # fmt: skip
     ax.legend(fontsize=8, loc="upper right")
 
 
