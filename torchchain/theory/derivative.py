@@ -29,7 +29,7 @@ def transfer_at(
     """``theory_transfer(...).mean``, [source, time, receiver], with its derivatives in strength and contact damping.
 
     The derivatives are central differences, each of two more transfers: the medium is solved to 1e-11, so that they hold to
-    1e-5, at a tenth of the cost of differentiation through the solver. The first derivative alone.
+    1e-5. The first derivative alone.
 
     Args:
         strength: xi of the masses, a scalar; one that requires its gradient gets it by ``backward``.
