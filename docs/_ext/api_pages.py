@@ -46,7 +46,7 @@ TOPICS: dict[str, tuple[str, str]] = {
     "species": ("Mixtures of species", "species.*"),
     "mixing": ("Nonlinear contacts: energy that mixes bands", "mixing.*"),
     "frames": ("Frames of other codes", "read_frames Frames FramesWarning frames.*"),
-    "networks": ("Networks: lattices and packings", "Network lattice packing network.*"),
+    "networks": ("Networks: lattices and packings", "Network lattice packing network.* ensemble.network_transfer"),
 }
 ROOMS = ("chain", "energy", "ensemble", "frames", "master", "mixing", "network", "species", "theory")
 
