@@ -258,7 +258,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     ax.axhline(1, color="k", lw=0.6, ls=":")
     ax.plot(math.sqrt(2), CENTER, "k*", ms=9, label="weak disorder at k = $\\pi$/2: 0.914")
     ax.set(
-        xlabel="frequency w",
+        xlabel=r"frequency $\omega$",
         ylabel="Lyapunov exponent / weak-disorder formula",
         ylim=(0.5, 1.2),
         title="(d) Matsuda and Ishii 1970",
@@ -271,8 +271,8 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         )
     w = data.low_frequency.values
     ax.plot(w, 2 / np.pi * np.arcsin(np.minimum(w / 2, 1)), "k--", lw=0.8, label="ordered")
-    ax.plot(w[w < 2], w[w < 2] / np.pi, "k:", lw=0.8, label="w / $\\pi$")
-    ax.set(xlabel="frequency w", ylabel="share of the modes below w", title="(e) density of states (Dyson 1953)")
+    ax.plot(w[w < 2], w[w < 2] / np.pi, "k:", lw=0.8, label=r"$\omega / \pi$")
+    ax.set(xlabel=r"frequency $\omega$", ylabel=r"share of modes below $\omega$", title="(e) density of states")
     ax.legend(fontsize="small")
     spreading_slopes(axes[1, 2], data, config)
     return figure
@@ -301,12 +301,12 @@ def spreading_slopes(ax: Axes, data: xarray.Dataset, config: Config) -> None:
         ax.axhline(limit, color=f"C{i}", lw=0.8, ls=(i, (2, 3)))
     ax.set(
         xlabel=plots.TIME_LABEL,
-        ylabel="local exponent d log r$^2$ / d log t",
+        ylabel=r"d log $r^2$ / d log $t$",
         xscale="log",
         xlim=(times[0], times[-1]),
         ylim=(0, 2.2),
     )
-    ax.set_title(f"(f) spreading at $\\xi$ = {config.spread_strength:g}; dotted: infinite time")
+    ax.set_title(f"(f) spreading, $\\xi$ = {config.spread_strength:g}")
     ax.legend(fontsize="small")
 
 

@@ -180,7 +180,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         axes[1, 0].plot(t[1:], data.noise.isel(strength=i)[1:], ":", color=f"C{i}", lw=0.8)
     band = band_of(config.tone, config.n_particles, config.n_bands)
     axes[0, 2].set(xlabel=plots.TIME_LABEL, ylabel="share left in it", ylim=(0, 1.02),
-                   title=f"band {band}; points: chains")  # fmt: skip
+                   title=f"band {band}")  # fmt: skip
     axes[0, 2].legend(fontsize=8)
     axes[1, 0].set(xscale="log", yscale="log", xlabel=plots.TIME_LABEL, ylabel="mean total variation from chains", ylim=(1e-5, 0.2),
                    title="theory (lines), ladder alone (dashed), noise (dotted)")  # fmt: skip
@@ -205,7 +205,7 @@ def _draw_rates(ax: Axes, data: xarray.Dataset, config: Config) -> None:
     ax.plot(data.source, data.born, ":", color="gray", label="Born: loss of coherence")
     top = 1.3 * max(float(-np.diag(data.rates_chains.values).min()), float(-np.diag(data.rates_chains.values).max()))
     ax.set(xlabel="band", ylabel="rate", ylim=(0, max(top, 1e-3)),
-           title=f"rates, $\\xi$ = {config.strength:g}; thin: 10 $Q_{{sr}}$ of source {config.n_bands * 23 // 32}")  # fmt: skip
+           title=f"rates; thin: 10 $Q_{{sr}}$, source {config.n_bands * 23 // 32}")  # fmt: skip
     ax.legend(fontsize=8)
 
 
@@ -214,7 +214,7 @@ def _draw_spectral(ax: Axes, data: xarray.Dataset, config: Config) -> None:
         ax.stairs(data.histogram[i], np.linspace(0, 2.6, HISTOGRAM + 1), color=f"C{i}", fill=True, alpha=0.3)
         ax.plot(data.frequency, data.spectral[i], color=f"C{i}", label=f"tone {tone}")
     ax.set(
-        xlabel="frequency w", ylabel="$A_k(w)$", title=f"spectral function, $\\xi$ = {config.strength:g}; bars: chains"
+        xlabel=r"frequency $\omega$", ylabel=r"$A_k(\omega)$; bars: chains", title=f"$\\xi$ = {config.strength:g}"
     )
     ax.legend(fontsize=8)
 
@@ -227,7 +227,7 @@ def _draw_cost(ax: Axes, data: xarray.Dataset, config: Config) -> None:
         ax.plot(data.cost[1, i], mean[1, i], "^", ms=5, mfc="none", color=f"C{i}")
     sizes = ", ".join(f"{size}" for size in config.sizes)
     ax.set(xscale="log", yscale="log", xlabel="processor time (s)", ylabel="mean total variation from the chains",
-           title=f"stars: theory, triangles: ladder alone,\nlines: ensembles of {sizes} chains")  # fmt: skip
+           title=f"stars: theory, triangles: ladder,\nlines: {sizes} chains")  # fmt: skip
     ax.legend(fontsize=8)
 
 
@@ -240,7 +240,7 @@ def _draw_edges(ax: Axes, data: xarray.Dataset, config: Config) -> None:
         if smooth.max() > FAILS > smooth.min() and min(smooth.shape) > 1:
             ax.contour(later.time, later.source, smooth.T, [FAILS], colors=f"C{i}", linestyles=STYLES[i % len(STYLES)])
     ax.set(xscale="log", xlabel=plots.TIME_LABEL, ylabel="source band", xlim=(config.step, config.stop), ylim=(1, config.n_bands + 1),
-           title=f"off by {FAILS:g} inside the lines")  # fmt: skip
+           title=f"off by {FAILS:g}: inside")  # fmt: skip
     ax.legend(fontsize=8, loc="upper right")
 
 
