@@ -8,12 +8,13 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
-from torchchain.master import logistic, waves
-from torchchain.master.certificate import certify
+from torchchain.master import compact, logistic, waves
+from torchchain.master.certificate import CertificateError, certify
 from torchchain.master.compact import CompactModel, n_coefficients
 from torchchain.master.compact_family import calibrate_together
 from torchchain.master.logistic import Regression, chosen_times, fit_compact, regression
 from torchchain.master.misfit import model_error
+from torchchain.master.proof import Certificate
 from torchchain.master.waves import Waves, first_odds
 
 B = 8
@@ -215,6 +216,22 @@ def test_nearest_model_with_memory(transfers):
     assert float(tc.total_variation(memory.transfer(times), model.transfer(times)).mean()) < 0.01
     parts = model.embedding()
     assert parts.start.shape[0] == B
+
+
+@pytest.mark.parametrize("lowest", [-5e-8, -1e-3])
+def test_nearest_model_where_none_is_certified(transfers, monkeypatch, lowest):
+    """The least negative one stands in if it is no lower than -1e-6; a model that is lower is no answer."""
+
+    def refuse(model, times, mean):
+        raise CertificateError("no", (model, Certificate(lowest, 1.0, 0.0, 1.0, 1)))
+
+    monkeypatch.setattr(compact, "nonnegative", refuse)
+    model, _ = fitted(transfers[0])
+    if lowest < -1e-6:
+        with pytest.raises(CertificateError):
+            model.as_memory(order=(1, 2), span=60.0)
+    else:
+        assert model.as_memory(order=(1, 2), span=60.0).n_bands == B
 
 
 # Families

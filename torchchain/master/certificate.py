@@ -30,7 +30,15 @@ NUMBERS = 2**17
 
 
 class CertificateError(ValueError):
-    """A model that was to be certified is not what its certificate says."""
+    """A model that was to be certified is not what its certificate says.
+
+    Attributes:
+        nearest: what came nearest to it and its certificate, if anything did.
+    """
+
+    def __init__(self, message: str, nearest: tuple[MemoryModel, Certificate] | None = None) -> None:
+        super().__init__(message)
+        self.nearest = nearest
 
 
 @dataclass(frozen=True, eq=False)

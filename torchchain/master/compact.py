@@ -33,6 +33,10 @@ from torchchain.master.waves import Waves, first_odds
 
 CLOCK = 10.0
 """t0 of the clock tau."""
+
+LOWEST_SHARE = -1e-6
+"""Least energy, of the whole, of a model with memory that stands for another where no certified one is found."""
+
 LARGEST_EXPONENT = 60.0
 
 
@@ -247,6 +251,8 @@ class CompactModel(TransferModel):
     def as_memory(self, order: tuple[int, int] = (4, 6), span: float = 1e3) -> MemoryModel:
         """The nearest model with memory, certified if undamped: exponentials for whoever needs a linear differential equation.
 
+        Where no order has one that is never negative, the least negative, if its energies are above -1e-6 of the whole.
+
         Args:
             order: numbers of exponentials and of pairs, or the next smaller ones with which a model is never negative.
             span: last time at which the two are compared.
@@ -270,6 +276,7 @@ def nearest_memory(model: TransferModel, order: tuple[int, int], span: float, da
     with torch.no_grad():
         mean, basis = own.transfer(times), own.basis
     order = checked_order(order, len(times))
+    near: list[tuple[float, MemoryModel]] = []
     for smaller in (order, *(known for known in ORDERS[::-1] if sum(known) < sum(order))):
         found = MemoryModel(rates=own.rates, **fit_memory(times, mean, basis, smaller)[0])
         if damped:  # what decays to nothing has no long-time energy to stay above of
@@ -278,6 +285,10 @@ def nearest_memory(model: TransferModel, order: tuple[int, int], span: float, da
             return nonnegative(found, times, mean)[0]
         except CertificateError as error:
             reason = error
+            if error.nearest is not None and error.nearest[1].lower > LOWEST_SHARE:
+                near.append((error.nearest[1].lower, error.nearest[0]))
+    if near:
+        return max(near, key=lambda each: each[0])[1]
     raise reason
 
 

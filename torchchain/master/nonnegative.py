@@ -138,7 +138,7 @@ def nonnegative(
             model.damping,
         )
 
-    lowest = -math.inf
+    nearest: tuple[MemoryModel, Certificate] | None = None
     for cut in CUTS:
         space = Space.of(*poles, grid, weight, cut)
         free = _least_squares(space, grid, weight, rest, (eye - basis).numpy())
@@ -155,8 +155,10 @@ def nonnegative(
             certificate = certify(found)
             if certificate.holds:
                 return found, certificate
-            lowest = max(lowest, certificate.lower)
-    raise CertificateError(f"model must have no negative energy, got {lowest:.3g} at best")
+            if nearest is None or certificate.lower > nearest[1].lower:
+                nearest = found, certificate
+    lowest = -math.inf if nearest is None else nearest[1].lower
+    raise CertificateError(f"model must have no negative energy, got {lowest:.3g} at best", nearest)
 
 
 def _least_squares(
