@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -577,7 +578,8 @@ def _edges(ax: Axes, data: xarray.Dataset) -> None:
         factor, ratio = float(one.factor), float(one.found / one.predicted)
         ax.fill_betweenx([y - 0.3, y + 0.3], 1 / factor, factor, color="0.88", linewidth=0)
         ax.plot(ratio, y, "o", color=COLORS[kind(str(one.answer.values), bool(one.by_design))])
-        labels.append(_symbols(f"{one.method.values}: {one.quantity.values}"))
+        label = _symbols(f"{one.method.values}: {one.quantity.values}  ({float(one.predicted):.4g})")
+        labels.append(textwrap.fill(label, 72, break_long_words=False))
     ax.axvline(1, color="k", linewidth=0.8)
     for name, color in COLORS.items():
         if name != "silent" or "silent" in {
@@ -585,15 +587,11 @@ def _edges(ax: Axes, data: xarray.Dataset) -> None:
         }:
             ax.plot([], [], "o", color=color, label=name)
     ax.fill_between([], [], [], color="0.88", label="how sharp the prediction is")
-    ax.set_yticks(
-        order,
-        [f"{label}  ({float(p):.4g})" for label, p in zip(labels, data.predicted.values, strict=True)],
-        fontsize=8,
-    )
+    ax.set_yticks(order, labels, fontsize=6, linespacing=0.9)  # the predicted value in brackets
     ax.set(
         xscale="log",
-        xlabel="edge found by bisection / predicted edge",
-        title="(a) edges (predicted value in brackets)",
+        xlabel="edge found / predicted (in brackets)",
+        title="(a) edges",
         xlim=(0.02, 300),
     )
     ax.xaxis.set_major_formatter("{x:g}")
@@ -628,7 +626,7 @@ def _curves(ax: Axes, data: xarray.Dataset) -> None:
     ax.axhline(1, color="k", linewidth=0.8)
     ax.axvline(1, color="k", linewidth=0.8, linestyle=":")
     ax.set(yscale="log", ylim=(1e-14, 3e12), xlabel="value / predicted edge", ylabel="what goes wrong / what is allowed",
-           title="(b) beyond the edge, without the guards")  # fmt: skip
+           title="(b) without guards")  # fmt: skip
     ax.legend(fontsize=8, loc="lower right")
 
 
