@@ -93,7 +93,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     axes = ("start", "quantity", "strength", "time")
     return xarray.Dataset(
         {
-            "chains": (axes, ratio, {"long_name": "chains for the same standard error, plain realizations = 1"}),
+            "chains": (axes, ratio, {"long_name": "chains for the same error, plain realizations = 1"}),
             "off": (axes, off, {"long_name": "difference of the means in units of its standard error"}),
         },
         coords={
@@ -114,7 +114,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
                 ax.plot(data.time, data.chains.sel(start=start, quantity=name).isel(strength=k), f"C{j}{dashes[k % 4]}")
         ax.axhline(1.0, color="k", lw=0.8)
         ax.set(yscale="log", xlabel=plots.TIME_LABEL, title=str(start), ylim=(0.02, 4))
-    axes[0, 0].set_ylabel("chains for the same standard error,\nplain realizations = 1")
+    axes[0, 0].set_ylabel("chains for the same error,\nplain realizations = 1")
     names = [Line2D([], [], color=f"C{j}", label=words) for j, words in enumerate(NAMES.values())]
     styles = [
         Line2D([], [], color="k", ls=dashes[k % 4], label=f"$\\xi$ = {xi:g}") for k, xi in enumerate(config.strengths)
