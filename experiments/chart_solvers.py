@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 
 import torchchain as tc
 from torchchain import checks
-from torchchain.master import TrustWarning, solving
+from torchchain.master import PredictionWarning, solving
 from torchchain.odes import INTEGRATORS
 from torchchain.threads import single_blas_thread
 
@@ -145,7 +145,7 @@ def _curve(
             return original(counted, *arguments, **settings)
 
         with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore", TrustWarning)
+            warnings.simplefilter("ignore", PredictionWarning)
             warnings.filterwarnings("ignore", message=".*have no effect for a chosen solver.*")
             warnings.simplefilter("ignore", RuntimeWarning)  # SciPy's BDF at its first step
             try:

@@ -15,7 +15,7 @@ from harness import Row
 from matplotlib.figure import Figure
 
 import torchchain as tc
-from torchchain.master import TrustWarning
+from torchchain.master import PredictionWarning
 from torchchain.master.fits import FitWarning
 
 MODELS = (("paper", "analytic"), ("paper", "linear"), ("basis_matrix", "linear"), (None, None))
@@ -75,7 +75,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
         for model, method in MODELS:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", FitWarning)
-                warnings.simplefilter("ignore", TrustWarning)
+                warnings.simplefilter("ignore", PredictionWarning)
                 master = tc.calibrate(own, method, model)
                 predicted = master.solve(eye, fresh.times).detach()
             distance = tc.total_variation(predicted, fresh.mean)

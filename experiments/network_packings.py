@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 import torchchain as tc
 from torchchain import network as nw
-from torchchain.master import TrustWarning
+from torchchain.master import PredictionWarning
 from torchchain.master.fits import FitWarning
 
 KINDS = ("masses", "stiffness", "removed bonds")
@@ -66,7 +66,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FitWarning)
-            warnings.simplefilter("ignore", TrustWarning)
+            warnings.simplefilter("ignore", PredictionWarning)
             master = tc.calibrate(own)
             predicted = master.solve(torch.eye(own.n_bands, dtype=torch.float64), own.times).detach()
         for found, values in ((model, predicted), (two, own.mean)):

@@ -1,4 +1,4 @@
-"""Every model of the ladder on fresh chains: error, trust and cost, over disorder, length and number of bands."""
+"""Every model of the ladder on fresh chains: error, error bars and cost, over disorder, length and number of bands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import torchchain as tc
-from torchchain.master import TrustWarning
+from torchchain.master import PredictionWarning
 from torchchain.master.fits import FitWarning
 from torchchain.master.ladder import fitted_by
 from torchchain.master.memory import ORDERS
@@ -158,7 +158,7 @@ def _score(
     """One line of the card: how far the predictions are from fresh chains, and what they cost."""
     times, eye = fresh.times, torch.eye(fresh.n_bands, dtype=torch.float64)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TrustWarning)
+        warnings.simplefilter("ignore", PredictionWarning)
         predicted = master.solve(eye, times).detach()
         one = statistics.median(_timed(lambda: master.solve(eye[:1], times))[1] for _ in range(9))
     later = times > 0

@@ -161,7 +161,7 @@ def masters(transfer):
     }
 
 
-@pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
+@pytest.mark.filterwarnings("ignore::torchchain.master.equation.PredictionWarning")
 @pytest.mark.parametrize("kind", ["markov", "swing_in", "memory"])
 @pytest.mark.parametrize("method", ["expm", "dopri8", "rk4", "implicit_adams"])
 def test_a_start_alone_equals_the_same_in_a_batch(masters, kind, method):
@@ -359,7 +359,7 @@ def test_single_precision_in_single_precision_out(what):
 
 
 @pytest.mark.parametrize("kind", ["markov", "swing_in", "memory"])
-@pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
+@pytest.mark.filterwarnings("ignore::torchchain.master.equation.PredictionWarning")
 def test_a_model_in_single_precision(masters, kind):
     single = copy.deepcopy(masters[kind]).float()
     for method in ("expm", "dopri5", "rk4"):

@@ -192,7 +192,7 @@ def test_compact_is_selected_by_name(transfer, compact):
     assert record.report.certificate.holds
     assert compact.conservation_defect == 0
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", tc.master.TrustWarning)  # times beyond the data
+        warnings.simplefilter("ignore", tc.master.PredictionWarning)  # times beyond the data
         energies = compact.solve(starts(), LATE)
     assert float(energies.min()) >= 0
     assert float((energies.sum(-1) - 1).abs().max()) < 1e-12

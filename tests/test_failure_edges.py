@@ -14,7 +14,7 @@ import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.evolvers.symplectic import MOST_STEPS
 from torchchain.master import Calibration
-from torchchain.master.equation import TrustWarning
+from torchchain.master.equation import PredictionWarning
 from torchchain.master.fits import FitWarning, nonlinear_rates
 from torchchain.modes.phase import PhaseWarning
 from torchchain.modes.spectrum import DecompositionError, SpectrumWarning
@@ -128,10 +128,10 @@ def test_energy_that_grows_beyond_all_numbers(method):
 
 
 def test_energy_that_is_made_or_negative_is_reported():
-    with pytest.warns(TrustWarning, match=r"grown by 0\.1\d .*conservation_defect 0\.01\b"):
+    with pytest.warns(PredictionWarning, match=r"grown by 0\.1\d .*conservation_defect 0\.01\b"):
         equation(tensor(PAIRS) + 0.01 * torch.eye(3)).solve(first(3), [1.0, 10.0])
     negative = tensor("-0.2 -0.2 0.4; 0.1 -0.3 0.2; 0.1 0.2 -0.3")
-    with pytest.warns(TrustWarning, match=r"lowest predicted energy of a band is -0\.1"):
+    with pytest.warns(PredictionWarning, match=r"lowest predicted energy of a band is -0\.1"):
         equation(negative).solve(first(3), torch.arange(11.0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

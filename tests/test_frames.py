@@ -160,7 +160,7 @@ def test_lammps_makes_the_stored_dumps_again(tmp_path):
             assert (old.positions - new.positions).abs().max() < 1e-10
 
 
-@pytest.mark.filterwarnings("ignore::torchchain.TrustWarning")
+@pytest.mark.filterwarnings("ignore::torchchain.PredictionWarning")
 def test_a_master_equation_from_imported_energies_is_as_good_as_the_ensemble():
     """Energies by the library stand for dumps; the second half of the chains is not seen by the fit."""
     config = replace(lammps_chains.Config(), n_particles=32, n_bands=4, realizations=40)

@@ -199,7 +199,7 @@ def test_every_public_function_is_here():
     }
     kinds = {
         *registries, "Advance", "DecompositionError", "FieldError", "FieldTypeError", "FitWarning", "Frames", "LinearityWarning",
-        "Method", "Observable", "ReducedModel", "RunFolder", "SpectrumWarning", "TrustWarning", "localization",
+        "Method", "Observable", "ReducedModel", "RunFolder", "SpectrumWarning", "PredictionWarning", "localization",
     }  # fmt: skip
     assert set(tc.__all__) - records - kinds <= set(CALLS)
 

@@ -14,7 +14,7 @@ import xarray
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.ensemble.plan import ARTIFACT
-from torchchain.master import MasterFamily, TrustWarning, calibrate_family, chapman_kolmogorov, implied_timescales
+from torchchain.master import MasterFamily, PredictionWarning, calibrate_family, chapman_kolmogorov, implied_timescales
 from torchchain.master.calibration import recipe
 from torchchain.master.model import equal_steps, flows
 from torchchain.master.rates import SwingInModel
@@ -273,7 +273,7 @@ def test_predictions_beyond_the_horizon_warn(small_transfer):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         master.solve(start, [0.0, end])
-    with pytest.warns(TrustWarning, match=f"to time {2 * end:g} lies beyond {end:g}"):
+    with pytest.warns(PredictionWarning, match=f"to time {2 * end:g} lies beyond {end:g}"):
         master.solve(start, [0.0, 2 * end])
 
 
@@ -289,7 +289,7 @@ def test_a_settled_ensemble_has_no_horizon():
 def test_negative_energies_warn():
     rates = torch.tensor([[-0.5, 0.5], [-0.1, 0.1]], dtype=torch.float64)
     master = tc.MasterEquation(tc.RateModel(rates, torch.zeros(2)), None)
-    with pytest.warns(TrustWarning, match="lowest predicted energy of a band is -"):
+    with pytest.warns(PredictionWarning, match="lowest predicted energy of a band is -"):
         master.solve([0.0, 1.0], [0.0, 1.0])
 
 
@@ -626,7 +626,7 @@ def test_families_from_the_command_line(family, tmp_path, capsys):
     assert "calibrated at 0.1, 0.2, 0.3, 0.4" in capsys.readouterr().out
     model, predicted = str(out / "model.safetensors"), tmp_path / "predicted"
     with warnings.catch_warnings():
-        warnings.simplefilter("error", TrustWarning)
+        warnings.simplefilter("error", PredictionWarning)
         assert main(["predict", model, "--strength", "0.25", "--out", str(predicted)]) == 0
     with xarray.open_dataset(predicted / "results.nc", engine="h5netcdf") as data:
         expected = family.solve(EYE, np.array(data.time), 0.25)

@@ -308,7 +308,7 @@ def transfer_scene(**fields):
     return tc.Scene(**{**given, **fields})
 
 
-@pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
+@pytest.mark.filterwarnings("ignore::torchchain.master.equation.PredictionWarning")
 def test_a_calibrated_model_takes_the_place_of_the_chains_where_it_covers_the_scene(master, tmp_path):
     wanted = transfer_scene(tolerance=0.2, times=regular_times(0.0, 40.0, 0.01), realizations=1000)
     planned = plan(wanted, artifact=master)

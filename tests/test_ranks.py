@@ -19,7 +19,7 @@ from torchchain.ensemble.statistics import joined
 
 FLAGS = "--n-particles 16 --n-bands 4 --realizations 45 --times.stop 5 --seed 3 --method modes".split()
 FIT = "--fit linear --model paper --bootstrap 0".split()  # quick
-pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.PredictionWarning")
 
 
 def python(folder, *arguments):

@@ -15,7 +15,7 @@ from torchchain.cli.rerun import difference
 from torchchain.ensemble import plan as planning
 
 SMALL = "--n-particles 16 --n-bands 4 --realizations 6 --times.stop 5 --seed 5".split()
-pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.TrustWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::torchchain.master.equation.PredictionWarning")
 
 
 @pytest.fixture(scope="module")

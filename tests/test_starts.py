@@ -365,7 +365,7 @@ def test_what_starts_in_space_cannot_do(master, transfer):
         master.solve(tc.Impulse(), [1.0], supply=np.ones(B))
     plain = tc.calibrate(replace(transfer, starts=None))
     assert plain.starts is None
-    with pytest.warns(tc.TrustWarning, match="calibrated without other starts"):
+    with pytest.warns(tc.PredictionWarning, match="calibrated without other starts"):
         found = plain.solve(tc.Impulse(), [1.0])
     torch.testing.assert_close(found, plain.solve(energy.excited(tc.Impulse(), N).bands(B), [1.0]))
 
@@ -489,5 +489,5 @@ def test_a_family_takes_any_start_between_its_members_and_tells_below_them():
         assert here < 3 * float(tc.statistical_distance(noise).mean())
     assert found.solve(tc.Impulse(), [0.0, 9.0]).shape == (2, 4)
     assert family.at(0.1).starts is None
-    with pytest.warns(tc.TrustWarning, match="calibrated without other starts"):
+    with pytest.warns(tc.PredictionWarning, match="calibrated without other starts"):
         family.at(0.1).solve(tc.Impulse(), [1.0])

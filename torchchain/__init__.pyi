@@ -68,13 +68,13 @@ from torchchain.master import IntegrationError as IntegrationError
 from torchchain.master import MasterEquation as MasterEquation
 from torchchain.master import MasterFamily as MasterFamily
 from torchchain.master import MemoryModel as MemoryModel
+from torchchain.master import PredictionWarning as PredictionWarning
 from torchchain.master import RateModel as RateModel
 from torchchain.master import Recipe as Recipe
 from torchchain.master import ReducedModel as ReducedModel
 from torchchain.master import Report as Report
 from torchchain.master import SwingInModel as SwingInModel
 from torchchain.master import TransferModel as TransferModel
-from torchchain.master import TrustWarning as TrustWarning
 from torchchain.master import Uncertainty as Uncertainty
 from torchchain.master import calibrate as calibrate
 from torchchain.master import calibrate_family as calibrate_family
@@ -82,6 +82,7 @@ from torchchain.master import chapman_kolmogorov as chapman_kolmogorov
 from torchchain.master import implied_timescales as implied_timescales
 from torchchain.master import paper_rates as paper_rates
 from torchchain.master import register_model as register_model
+from torchchain.master.equation import PredictionWarning as TrustWarning  # noqa: F401 (its earlier name)
 from torchchain.master.stand_in import plan as plan
 from torchchain.modes import DecompositionError as DecompositionError
 from torchchain.modes import NormalModes as NormalModes

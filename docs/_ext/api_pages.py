@@ -39,7 +39,7 @@ TOPICS: dict[str, tuple[str, str]] = {
         "Master equations",
         "calibrate MasterEquation calibrate_family MasterFamily paper_rates chapman_kolmogorov ChapmanKolmogorov "
         "implied_timescales MODELS SOLVERS register_model ReducedModel Fit Recipe TransferModel RateModel "
-        "SwingInModel MemoryModel Calibration Report Uncertainty TrustWarning FitWarning IntegrationError",
+        "SwingInModel MemoryModel Calibration Report Uncertainty PredictionWarning FitWarning IntegrationError",
     ),
     "parts": ("Parts of a calibration", "master.*"),
     "theory": ("Theory", "theory.*"),

@@ -4,7 +4,7 @@ from torchchain.master.adam import AdamReport, AdamSettings
 from torchchain.master.calibration import calibrate
 from torchchain.master.derived import TheoryModel
 from torchchain.master.diagnostics import ChapmanKolmogorov, chapman_kolmogorov, implied_timescales
-from torchchain.master.equation import MasterEquation, TrustWarning
+from torchchain.master.equation import MasterEquation, PredictionWarning
 from torchchain.master.family import MasterFamily, calibrate_family
 from torchchain.master.fits import AnalyticReport, FitWarning, NonlinearReport
 from torchchain.master.ladder import MODELS, register_model
@@ -21,7 +21,8 @@ from torchchain.master.uncertainty import Uncertainty
 __all__ = [
     "MODELS", "SOLVERS", "AdamReport", "AdamSettings", "AnalyticReport", "Calibration", "ChapmanKolmogorov",
     "Embedding", "Fit", "FitWarning", "IntegrationError", "Loss", "MasterEquation", "MasterFamily", "MemoryModel",
-    "NoSettings", "NonlinearReport", "ProjectionReport", "ProjectionSettings", "RateModel", "Recipe", "ReducedModel",
-    "Report", "Rung", "Sample", "Selection", "SwingInModel", "TheoryModel", "TransferModel", "TrustWarning", "Uncertainty", "calibrate",
-    "calibrate_family", "chapman_kolmogorov", "implied_timescales", "paper_rates", "register_model",
+    "NoSettings", "NonlinearReport", "PredictionWarning", "ProjectionReport", "ProjectionSettings", "RateModel",
+    "Recipe", "ReducedModel", "Report", "Rung", "Sample", "Selection", "SwingInModel", "TheoryModel", "TransferModel",
+    "Uncertainty", "calibrate", "calibrate_family", "chapman_kolmogorov", "implied_timescales", "paper_rates",
+    "register_model",
 ]  # fmt: skip

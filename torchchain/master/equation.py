@@ -20,13 +20,11 @@ from torchchain.ensemble.printed import Printed
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.scene_words import describe
 from torchchain.master import file
-from torchchain.master.certificate import certify
-from torchchain.master.compact import CompactModel
-from torchchain.master.derived import TheoryModel
+from torchchain.master.coarsening import coarsen
+from torchchain.master.concerns import differences
 from torchchain.master.fits import AnalyticReport
-from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
-from torchchain.master.report import Calibration, Report
+from torchchain.master.report import Calibration
 from torchchain.master.solving import SOLVERS, IntegrationError
 from torchchain.master.starts import StartModel
 from torchchain.master.uncertainty import Uncertainty
@@ -41,7 +39,7 @@ GAINED_SHARE = 1e-2
 """Nor is energy that a model makes, up to this share of the total."""
 
 
-class TrustWarning(UserWarning):
+class PredictionWarning(UserWarning):
     """A prediction beyond what the model was compared with, or with energies that cannot be.
 
     Example:
@@ -51,7 +49,7 @@ class TrustWarning(UserWarning):
         >>> with warnings.catch_warnings(record=True) as told:
         ...     warnings.simplefilter("always")
         ...     _ = master.solve(torch.eye(8, dtype=torch.float64), [0.0, 1e4])  # far beyond the chains
-        >>> any(issubclass(warning.category, tc.TrustWarning) for warning in told)
+        >>> any(issubclass(warning.category, tc.PredictionWarning) for warning in told)
         True
     """
 
@@ -183,7 +181,7 @@ class MasterEquation(Printed, nn.Module):
             IntegrationError: if the solver fails, with its numbers.
 
         Warns:
-            TrustWarning: for times beyond the model's horizon, for a band with a clearly negative energy, and for energy made.
+            PredictionWarning: for times beyond the model's horizon, for a band with a clearly negative energy, and for energy made.
 
         Example:
             >>> import torch, torchchain as tc
@@ -206,7 +204,7 @@ class MasterEquation(Printed, nn.Module):
         if start is not None:
             warnings.warn(
                 "the model was calibrated without other starts: energies of bands are taken as those of its own tones, released at rest",
-                TrustWarning,
+                PredictionWarning,
                 stacklevel=2,
             )
         initial = self._initial(initial if start is None else start.bands(self.n_bands))
@@ -259,7 +257,7 @@ class MasterEquation(Printed, nn.Module):
         if end > self.horizon * (1 + 1e-9):
             warnings.warn(
                 f"prediction to time {end:g} lies beyond {self.horizon:g}, up to which this model was compared with chains",
-                TrustWarning,
+                PredictionWarning,
                 stacklevel=3,
             )
         if not energy.numel() or bool((initial < 0).any()) or (fed is not None and bool((fed < 0).any())):
@@ -275,14 +273,14 @@ class MasterEquation(Printed, nn.Module):
             warnings.warn(
                 f"predicted energy has grown by {float(gained.max()):.2g} of the total at time {when:g}: rows of the rates "
                 f"that do not sum to zero make energy (conservation_defect {self.conservation_defect:.2g})",
-                TrustWarning,
+                PredictionWarning,
                 stacklevel=3,
             )
         lowest = float((energy.amin(-1) / total).min())
         if lowest < -NEGATIVE_SHARE:
             warnings.warn(
                 f"lowest predicted energy of a band is {lowest:.2g} of the total: the model is that uncertain there",
-                TrustWarning,
+                PredictionWarning,
                 stacklevel=3,
             )
 
@@ -324,35 +322,7 @@ class MasterEquation(Printed, nn.Module):
             found.append(f"times to {end:g}, compared with chains to {self.horizon:g}")
         if own is None:
             return [*found, "chains that are described, where its own energies came without a scene"]
-        others = (
-            "lattice",
-            "shape",
-            "motion",
-            "removed_bonds",
-            "position_disorder",
-            "species",
-            "arrangement",
-            "unlike",
-            "by_species",
-        )
-        for name in (*others, "boundary", "damping", "contact", "energy_definition"):
-            if getattr(scene, name) != getattr(own, name):
-                found.append(f"{name} {getattr(scene, name)}, calibrated on {getattr(own, name)}")
-        masses = (scene.disorder.kind, own.disorder.kind)
-        if masses[0] != masses[1] or scene.stiffness_disorder != own.stiffness_disorder:
-            found.append("another kind of disorder")
-        for name in ("strength", "lower"):
-            here, there = (float(getattr(other.disorder, name)) for other in (scene, own))
-            if abs(here - there) > 1e-9:
-                found.append(f"disorder {name} {here:g}, calibrated on {there:g}".replace(" strength", ""))
-        shorter = min(scene.n_particles, own.n_particles)
-        if scene.n_particles != own.n_particles and end > shorter:
-            found.append(
-                f"{scene.n_particles} particles, calibrated on {own.n_particles}, and waves that go round by t = {shorter}"
-            )
-        if self.starts is not None and scene.n_particles == self.starts.n_particles:
-            return found  # any start will do
-        return [*found, *_other_start(scene, own)]
+        return found + differences(scene, own, self.starts)
 
     def plot_rates(self, ax: Axes | None = None) -> Axes:
         """:attr:`rates` as colors (Fig. 17), the diagonal as rates of loss -Q_ss, on axes of a figure of its own if none are given."""
@@ -368,34 +338,7 @@ class MasterEquation(Printed, nn.Module):
         Raises:
             FieldError: for a number of bands that does not divide the present one, or a model without memory.
         """
-        own = self.model.as_memory() if isinstance(self.model, CompactModel | TheoryModel) else self.model
-        if not isinstance(own, MemoryModel):
-            raise checks.fail("model", "be 'memory' to be coarsened", repr(self.calibration.model))
-        n_bands = checks.integer("n_bands", n_bands, 1, self.n_bands)
-        if self.n_bands % n_bands:
-            raise checks.fail("n_bands", f"divide the {self.n_bands} bands of the model", n_bands)
-        size = self.n_bands // n_bands
-        joined = torch.eye(n_bands).to(self.basis).repeat_interleave(size, dim=0)
-        tensors = own.tensors()
-        for name in ("rates", "basis", "amplitudes"):
-            tensors[name] = joined.T / size @ tensors[name] @ joined
-        tensors["damping"] = tensors["damping"] @ joined / size
-        record, errors = self.calibration, self.uncertainty
-        record = replace(record, scene=_joined_scene(record.scene, n_bands), report=self._joined_report(joined))
-        model = MemoryModel(**tensors)
-        if self.calibration.report.certificate is not None:  # sums of what is not negative; proved again all the same
-            proof = certify(model)
-            record = replace(record, report=replace(record.report, certificate=proof if proof.holds else None))
-        return MasterEquation(model, record, None if errors is None else errors.coarsened(joined))
-
-    def _joined_report(self, joined: Tensor) -> Report:
-        loss = self.calibration.report.loss
-        if loss is not None:
-            rates = torch.tensor(loss.rates).to(joined) @ joined / joined.sum(0)
-            loss = replace(loss, rates=tuple(rates.tolist()))
-        return Report(
-            loss=loss, horizon=self.horizon, bootstrap=self.calibration.report.bootstrap, coarsened_from=self.n_bands
-        )
+        return MasterEquation(*coarsen(self.model, self.calibration, self.uncertainty, n_bands))
 
     def forward(self, initial: Tensor, times: Tensor) -> Tensor:
         """:meth:`solve` by the matrix exponential."""
@@ -428,34 +371,3 @@ class MasterEquation(Printed, nn.Module):
             FieldError: naming the file and what is wrong with it.
         """
         return cls(*file.load(path))
-
-
-def _other_start(scene: Scene, own: Scene) -> list[str]:
-    """How the start of a scene differs from the standing waves of the calibration, in words."""
-    wave, known = scene.excitation, own.excitation
-    assert isinstance(known, StandingWave), "transfers come from standing waves"
-    if not isinstance(wave, StandingWave):
-        return ["an impulse, calibrated on standing waves"]
-    found = []
-    if scene.contact != "linear" and wave.amplitude != known.amplitude:  # of linear chains it does not matter
-        found.append(f"amplitude {wave.amplitude:g}, calibrated on {known.amplitude:g}")
-    if wave.phase != known.phase and scene.boundary != "periodic":  # on a ring they are the same on average
-        found.append(f"phase {wave.phase}, calibrated on {known.phase}")
-    places = {round(_place(tone, own), 9) for tone in own.tones}
-    others = [tone for tone in scene.tones if round(_place(tone, scene), 9) not in places]
-    if others:
-        found.append(f"tone {others[0]} of {scene.n_particles} particles, no tone of the calibration")
-    return found
-
-
-def _place(tone: int, scene: Scene) -> float:
-    """Wavenumber of a tone, 1 for pi."""
-    return 2 * tone / scene.n_particles
-
-
-def _joined_scene(scene: Scene | None, n_bands: int) -> Scene | None:
-    """The scene with fewer bands and their center tones."""
-    if scene is None:
-        return None
-    assert isinstance(scene.excitation, StandingWave), "transfers come from standing waves"
-    return replace(scene, n_bands=n_bands, excitation=replace(scene.excitation, tones=None))
