@@ -88,13 +88,6 @@ def test_bound_holds_and_counts_fit(kind, boundary, motion):
     torch.testing.assert_close(gram, torch.eye(gram.shape[-1], dtype=F64).expand_as(gram), atol=1e-11, rtol=0)
 
 
-def test_bound_by_the_compiled_loop_is_the_same(monkeypatch):
-    network = random_network()
-    plain = network.squared_frequency_bound()
-    monkeypatch.setattr("torchchain.network.networks.MANY", 0)
-    torch.testing.assert_close(network.squared_frequency_bound(), plain, rtol=1e-13, atol=0)
-
-
 @pytest.mark.parametrize("motion", ["vector", "scalar"])
 @pytest.mark.parametrize("kind", LATTICES)
 def test_modes_of_ordered_lattices_are_the_dispersion_relation(kind, motion):

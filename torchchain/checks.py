@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -153,14 +153,39 @@ def real_tensor(field: str, value: Any) -> Tensor:
 
 def is_transformed(values: Tensor) -> bool:
     """Whether ``torch.func.grad`` or ``vmap`` traces the tensor: its values are not to be looked at, and pass all checks."""
-    return torch._C._functorch.is_functorch_wrapped_tensor(values)  # there is no public way
+    try:
+        values.data_ptr()
+    except RuntimeError:  # what stands for values has no place in memory
+        return True
+    return False
+
+
+class _Seen(torch.autograd.Function):
+    """Hands on the values that are traced, once every transform is peeled off."""
+
+    @staticmethod
+    def forward(values: Tensor, keep: Callable[[Tensor], None]) -> Tensor:
+        keep(values)
+        return values.clone()
+
+    @staticmethod
+    def setup_context(*_: Any) -> None:
+        """Nothing is kept: no gradient comes through here."""
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int, None], values: Tensor, keep: Callable[[Tensor], None]
+    ) -> tuple[Tensor, int]:
+        return _Seen.apply(values.movedim(in_dims[0], 0), keep), 0
 
 
 def traced_values(values: Tensor) -> Tensor:
-    """The numbers inside what ``torch.func`` traces, with an axis more for every ``vmap``; for bounds that hold for all."""
-    while is_transformed(values):
-        values = torch._C._functorch.get_unwrapped(values)
-    return values
+    """The numbers inside what ``torch.func`` traces, with an axis in front for every ``vmap``; for bounds that hold for all."""
+    if not is_transformed(values):
+        return values
+    held: list[Tensor] = []
+    _Seen.apply(values.detach(), held.append)
+    return held[0]
 
 
 def finite(field: str, values: Tensor, axis: str = "position") -> Tensor:

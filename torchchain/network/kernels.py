@@ -307,40 +307,6 @@ def _add_row(total, keep, now, new, a, b, c, width):
 
 
 @_kernel
-def squared_bound(bonds, blocks, own, masses, sweeps):
-    """See :meth:`torchchain.network.networks.Network.squared_frequency_bound`; blocks and own without signs."""
-    n, c = own.shape[0], own.shape[1]
-    x, image = np.ones((n, c)), np.empty((n, c))
-    largest = 0.0
-    for _ in range(sweeps + 1):
-        for p in range(n):
-            for a in range(c):
-                image[p, a] = 0.0
-                for b in range(c):
-                    image[p, a] += own[p, a, b] * x[p, b]
-        for e in range(len(bonds)):
-            i, j = bonds[e, 0], bonds[e, 1]
-            if i >= n or j >= n:
-                continue
-            for a in range(c):
-                for b in range(c):
-                    image[i, a] += blocks[e, a, b] * x[j, b]
-                    image[j, a] += blocks[e, a, b] * x[i, b]
-        largest, top = 0.0, 0.0
-        for p in range(n):
-            for a in range(c):
-                ratio = image[p, a] / masses[p] / x[p, a]
-                largest = max(largest, ratio)
-                x[p, a] = np.sqrt(x[p, a] * x[p, a] * ratio)
-                top = max(top, x[p, a])
-        scale = 1.0 / max(top, 1e-300)
-        for p in range(n):
-            for a in range(c):
-                x[p, a] = max(x[p, a] * scale, 1e-60)
-    return largest
-
-
-@_kernel
 def grain_force(x, radii, pairs, shifts, hertz, modulus, damping, velocity, force):
     """Contact forces between grains at x, (particle, component), written to ``force``.
 

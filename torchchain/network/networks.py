@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,7 +16,6 @@ from torchchain.network import bonds
 
 MOTIONS = ("vector", "scalar")
 SWEEPS = 8  # of the bound's power iteration
-MANY = 20_000  # bonds from which the bound is worth a compiled loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,18 +318,26 @@ class Network:
         Args:
             member: its index in the batch.
         """
+        return next(self._sparse([member])).tocsr()
+
+    def _sparse(self, members: Iterable[tuple[int, ...]]) -> Iterator[sparse.bsr_matrix]:
+        """K of some networks of the batch in blocks of a particle's components, those of a pair as often as it has bonds."""
         n, c = self.n_particles, self.n_components
+        first, second = self.bonds.cpu().unbind(-1)
+        i, j = first.numpy(), second.numpy()
+        bond, own = np.flatnonzero((i < n) & (j < n)), np.arange(n)
+        rows = np.concatenate([own, i[bond], j[bond]])
+        order = rows.argsort(kind="stable")
+        columns = np.concatenate([own, j[bond], i[bond]])[order]
+        which = np.concatenate([own, n + bond, n + bond])[order]
+        starts = np.append(0, np.bincount(rows, minlength=n).cumsum())
         with torch.no_grad():
-            blocks = self.bond_matrices().expand(*self.batch_shape, self.n_bonds, c, c)[member].double().cpu().numpy()
-        i, j = self.bonds.cpu().numpy().T
-        rows, columns = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
-        data = np.concatenate([blocks, blocks, -blocks, -blocks])
-        inside = (rows < n) & (columns < n)
-        rows, columns, data = rows[inside], columns[inside], data[inside]
-        a = np.arange(c)
-        rows = (rows[:, None, None] * c + a[:, None]).repeat(c, axis=2).reshape(-1)
-        columns = (columns[:, None, None] * c + a).repeat(c, axis=1).reshape(-1)
-        return sparse.coo_matrix((data.reshape(-1), (rows, columns)), shape=(n * c, n * c)).tocsr()
+            every = self.bond_matrices().expand(*self.batch_shape, self.n_bonds, c, c)
+        for member in members:
+            blocks = every[member].double().cpu()
+            ends = blocks.new_zeros(n + self.n_anchors, c, c).index_add(0, first, blocks).index_add(0, second, blocks)
+            data = torch.cat([ends[:n], -blocks]).numpy()[which]
+            yield sparse.bsr_matrix((data, columns, starts), shape=(n * c, n * c))
 
     def squared_frequency_bound(self, sweeps: int = SWEEPS) -> Tensor:
         """A rigorous upper bound on every |w^2|, (*batch,), float64.
@@ -337,46 +345,19 @@ class Network:
         No eigenvalue of M^-1 K exceeds the largest of (|M^-1 K| x) / x over the unknowns, for any positive x (Collatz
         and Wielandt; Gershgorin's is x = 1). Some power steps make x a good one, and two ulps cover the rounding.
         """
-        with torch.no_grad():
-            c = self.n_components
-            blocks = self.bond_matrices().double().expand(*self.batch_shape, self.n_bonds, c, c)
-            masses = self.masses.double()[..., None]
-            points = self.n_particles + self.n_anchors
-            own = blocks.new_zeros(*self.batch_shape, points, c, c)
-            i, j = self.bonds.unbind(-1)
-            own = own.index_add(-3, i, blocks).index_add(-3, j, blocks)[..., : self.n_particles, :, :].abs()
-            blocks = blocks.abs()
-            if self.n_bonds > MANY and blocks.device.type == "cpu":
-                largest = self._compiled_bound(blocks, own, sweeps)
-                return torch.minimum(largest * (1 + 1e-14), self._other_bound(masses))
-            x = torch.ones(*self.batch_shape, self.n_particles, c, dtype=torch.float64, device=masses.device)
-            ratio = x
+        masses = self.masses.detach().double()
+        flat = masses.cpu().reshape(-1, self.n_particles).repeat_interleave(self.n_components, 1).numpy()
+        largest = []
+        for matrix, mass in zip(self._sparse(np.ndindex(*self.batch_shape)), flat, strict=True):
+            size, x = abs(matrix), np.ones_like(mass)
             for _ in range(sweeps + 1):
-                padded = torch.nn.functional.pad(x, (0, 0, 0, self.n_anchors))
-                image = torch.zeros_like(padded)
-                image = image.index_add(-2, i, _product(blocks, padded.index_select(-2, j)))
-                image = image.index_add(-2, j, _product(blocks, padded.index_select(-2, i)))
-                image = (image[..., : self.n_particles, :] + _product(own, x)) / masses
-                ratio = image / x
+                ratio = size @ x / mass / x
                 # The geometric mean of x and its image does not alternate; a rattler, which no bond holds, keeps its x.
-                x = (x * image).sqrt()
-                x = x / x.amax((-2, -1), keepdim=True).clamp(min=1e-300)
-                x = x.clamp(min=1e-60)
-            largest = ratio.amax((-2, -1)) * (1 + 1e-14)
-            return torch.minimum(largest, self._other_bound(masses))
-
-    def _compiled_bound(self, blocks: Tensor, own: Tensor, sweeps: int) -> Tensor:
-        """The same by a loop over the bonds, for many of them."""
-        from torchchain.network import kernels  # imports Numba
-
-        c, n = self.n_components, self.n_particles
-        bonds = self.bonds.numpy()
-        masses = self.masses.detach().double().reshape(-1, n).numpy()
-        members = zip(
-            blocks.reshape(-1, self.n_bonds, c, c).numpy(), own.reshape(-1, n, c, c).numpy(), masses, strict=True
-        )
-        values = [kernels.squared_bound(bonds, b, o, m, sweeps) for b, o, m in members]
-        return torch.tensor(values, dtype=torch.float64).reshape(self.batch_shape)
+                x = x * np.sqrt(ratio)
+                x = np.maximum(x / max(x.max(), 1e-300), 1e-60)
+            largest.append(ratio.max() * (1 + 1e-14))
+        found = torch.tensor(largest, dtype=torch.float64, device=masses.device).reshape(self.batch_shape)
+        return torch.minimum(found, self._other_bound(masses[..., None]))
 
     def _other_bound(self, masses: Tensor) -> Tensor:
         """A second bound (*batch,), where a special kind of network knows one; infinite here."""
@@ -399,8 +380,3 @@ class Network:
         for name in ("stiffness", "tension", "damping"):
             fields[name] = torch.as_tensor(getattr(self, name))[..., keep]
         return fields
-
-
-def _product(blocks: Tensor, x: Tensor) -> Tensor:
-    """Blocks (..., c, c) times vectors (..., c)."""
-    return (blocks * x[..., None, :]).sum(-1)
