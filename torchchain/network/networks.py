@@ -349,9 +349,10 @@ class Network:
         flat = masses.cpu().reshape(-1, self.n_particles).repeat_interleave(self.n_components, 1).numpy()
         largest = []
         for matrix, mass in zip(self._sparse(np.ndindex(*self.batch_shape)), flat, strict=True):
-            size, x = abs(matrix), np.ones_like(mass)
+            np.abs(matrix.data, out=matrix.data)
+            x = np.ones_like(mass)
             for _ in range(sweeps + 1):
-                ratio = size @ x / mass / x
+                ratio = matrix @ x / mass / x
                 # The geometric mean of x and its image does not alternate; a rattler, which no bond holds, keeps its x.
                 x = x * np.sqrt(ratio)
                 x = np.maximum(x / max(x.max(), 1e-300), 1e-60)
