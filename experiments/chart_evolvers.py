@@ -300,7 +300,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     for ax in axes[:rows, :].flat:
         ax.set_xlabel("processor seconds, median")
     for ax in axes[rows:, :].flat:
-        ax.set_xlabel("stencil updates (evaluations $\\times$ particles)")
+        ax.set_xlabel("evaluations $\\times$ particles")
     for ax in axes[:, 0]:
         ax.set_ylabel("relative error (energy norm)")
     shown = [name for name in tc.METHODS if name in set(data.method.values)]
