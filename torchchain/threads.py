@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import TypeVar
 
 import torch
@@ -16,28 +17,46 @@ Result = TypeVar("Result")
 
 
 @contextmanager
-def single_thread() -> Iterator[None]:
-    """Run on one thread, then restore the number.
+def single_thread() -> Iterator[int]:
+    """Run on one thread, then restore the number, which it gives.
 
     Products of matrices of some 32 rows gain nothing from more threads, and wait for them where other processes
     hold the cores: 60 times slower was measured beside a busy process.
     """
     before = torch.get_num_threads()
     if before == 1:
-        yield
+        yield before
         return
     torch.set_num_threads(1)
     try:
-        yield
+        yield before
     finally:
         torch.set_num_threads(before)
 
 
 @contextmanager
-def single_blas_thread() -> Iterator[None]:
+def single_blas_thread() -> Iterator[int]:
     """:func:`single_thread` for NumPy and SciPy too; finding their libraries takes some milliseconds."""
-    with single_thread(), threadpool_limits(1, user_api="blas"):
-        yield
+    with single_thread() as before, threadpool_limits(1, user_api="blas"):
+        yield before
+
+
+@contextmanager
+def beside(work: Callable[[], Result], workers: int) -> Iterator[Callable[[], Result]]:
+    """Do other work meanwhile, on a thread of one core; gives how to wait for its result.
+
+    With one worker it is done when the result is asked for.
+    """
+    if workers <= 1:
+        yield work
+        return
+    pool = ThreadPoolExecutor(1, thread_name_prefix="torchchain", initializer=partial(torch.set_num_threads, 1))
+    try:
+        yield pool.submit(work).result
+    except BaseException:  # nobody wants what is under way
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
 
 
 def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:

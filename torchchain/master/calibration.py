@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -28,6 +29,7 @@ from torchchain.master.selection import nearest_sure, select
 from torchchain.master.starts import can_fit, fit_starts, with_errors
 from torchchain.master.uncertainty import draw_again, horizon
 from torchchain.progress import bar
+from torchchain.threads import beside, single_blas_thread
 
 LINEAR_WINDOW = (0.5, 2.0)
 REPLICATES = 20
@@ -161,9 +163,14 @@ def calibrate(
     if transfer.is_ordered:
         return _ordered(transfer, asked)
     report, near, errors = Report(), None, None
-    with bar("calibrating", None, "step", progress) as shown:
+    starts = partial(fit_starts, transfer) if can_fit(transfer) else lambda: None
+    with (
+        single_blas_thread() as threads,
+        beside(starts, threads) as starts_fitted,
+        bar("calibrating", None, "step", progress) as shown,
+    ):
         if not asked.complete:
-            asked, selection, near = select(transfer, asked, shown.update)
+            asked, selection, near = select(transfer, asked, shown.update, threads)
             report = replace(report, selection=selection)
         sample = Sample.of(transfer)
         fitted, told = asked.run(sample, near, shown.update)
@@ -186,10 +193,10 @@ def calibrate(
         _check_growth(fitted, asked)
         if count:
             errors = draw_again(transfer, asked, free, count, shown.update, fitted)
-        starts = fit_starts(transfer) if can_fit(transfer) else None
-        if starts is not None and errors is not None:
-            starts = with_errors(starts, transfer, errors)
-    return MasterEquation(fitted, _record(transfer, asked, report), errors, starts)
+        moved = starts_fitted()
+        if moved is not None and errors is not None:
+            moved = with_errors(moved, transfer, errors)
+    return MasterEquation(fitted, _record(transfer, asked, report), errors, moved)
 
 
 def _settled(transfer: BandTransfer) -> BandTransfer:

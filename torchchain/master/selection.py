@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import groupby
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,10 +17,11 @@ from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import FitWarning
 from torchchain.master.ladder import MODELS
 from torchchain.master.model import TransferModel
-from torchchain.master.records import Progress, Recipe
+from torchchain.master.records import Progress, Recipe, ReducedModel
 from torchchain.master.report import Rung, Selection
 from torchchain.master.sample import Sample, decade_weights, exact_basis
 from torchchain.master.uncertainty import kept_times
+from torchchain.threads import map_in_order
 
 AS_GOOD = 1.1
 """Foreseen distance, over that of the nearest model, of a smaller one that takes its place."""
@@ -53,20 +57,37 @@ def rungs(asked: Recipe, transfer: BandTransfer) -> list[Recipe]:
     return sure if damped and sure else ordered
 
 
-def _size(recipe: Recipe, transfer: BandTransfer) -> int:
+def _model(recipe: Recipe) -> ReducedModel:
     assert recipe.model is not None, "a rung names its model"
-    return recipe.model.size(transfer.n_bands, transfer.damping > 0, recipe.settings)
+    return recipe.model
+
+
+def _size(recipe: Recipe, transfer: BandTransfer) -> int:
+    return _model(recipe).size(transfer.n_bands, transfer.damping > 0, recipe.settings)
+
+
+def _is_sure(recipe: Recipe, transfer: BandTransfer) -> bool:
+    """Whether a rung is tried also where a smaller model will do."""
+    return bool(_model(recipe).windows) and _size(recipe, transfer) <= LARGE
+
+
+def _batches(candidates: list[Recipe], transfer: BandTransfer) -> Iterator[list[Recipe]]:
+    """The rungs in order, those together of which each is tried whatever the others show."""
+    for sure, some in groupby(candidates, lambda recipe: _is_sure(recipe, transfer)):
+        rungs = list(some)
+        yield from [rungs] if sure else [[each] for each in rungs]
 
 
 def select(
-    transfer: BandTransfer, asked: Recipe, progress: Progress = None
+    transfer: BandTransfer, asked: Recipe, progress: Progress = None, workers: int = 1
 ) -> tuple[Recipe, Selection, TransferModel | None]:
     """The first rung that, fitted on every other block, predicts the rest as well as the fitted blocks' means do.
 
     As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time will do if,
     fitted to all blocks, it is foreseen to be within ``near`` times the noise in every one, and is taken if no larger
     one of its like is foreseen to be nearer by more than a tenth, nor one as near that predicts faster. If none will do,
-    the nearest is taken. Models with rates are tried with procedure L.
+    the nearest is taken. Models with rates are tried with procedure L. Rungs of different kinds that are tried in any case
+    are fitted side by side on as many threads as there are ``workers``, one thread of BLAS each.
 
     Returns:
         The recipe of the rung, what was tried, and the model fitted to half of the blocks.
@@ -89,40 +110,63 @@ def select(
     refused: checks.FieldError | None = None
 
     def fitted(recipe: Recipe, sample: Sample, near: TransferModel | None = None) -> tuple[TransferModel, Tensor]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FitWarning)
-            model, _ = recipe.run(sample, near, progress)
+        model, _ = recipe.run(sample, near, progress)
         return model, model.transfer(times).detach()
 
-    for candidate in candidates:
-        record = candidate.model
-        assert record is not None, "a rung names its model"
-        if enough and (not record.windows or _size(candidate, transfer) > LARGE):
-            continue
-        try:
-            like = next((m for m in models[::-1] if record.windows and isinstance(m, record.kind)), None)
-            model, found = fitted(candidate, parts[0], like)
-        except checks.FieldError as error:  # of half of the data no model of this kind can be made
-            refused = error
-            continue
-        chosen.append(candidate)
+    def attempt(candidate: Recipe, known: list[TransferModel]) -> tuple[TransferModel, float, float | None]:
+        """The model, its distance, and that foreseen if it will do."""
+        record = _model(candidate)
+        like = next((m for m in known[::-1] if record.windows and isinstance(m, record.kind)), None)
+        model, found = fitted(candidate, parts[0], like)
         missed = total_variation(found, means[1]).mean(0)
-        tried.append(Rung(record.name, candidate.order, float(missed @ weight)))
-        models.append(model)
+        distance = float(missed @ weight)
         if not record.windows:
-            if tried[-1].distance <= ENOUGH * noise:
-                enough[len(tried) - 1] = 1.0
+            return model, distance, 1.0 if distance <= ENOUGH * noise else None
+        if not foreseen(halves, missed, halves) @ weight <= record.near:  # sure to be too far off
+            return model, distance, None
+        _, other = fitted(candidate, parts[1], model)
+        both = (missed + total_variation(other, means[0]).mean(0)) / 2
+        spread = total_variation(found, other).mean(0)
+        ahead = [
+            float(foreseen(*(part[window].mean() for part in (halves, both, spread))))
+            for window in windows(times, record.windows)
+        ]
+        return model, distance, sum(ahead) / len(ahead) if max(ahead) <= record.near else None
+
+    def climb(ladder: list[tuple[int, Recipe]]) -> dict[int, Any]:
+        """What became of rungs of one kind, each beginning with the model of the one before, by their place."""
+        found: dict[int, Any] = {}
+        for place, candidate in ladder:
+            known = [*models, *(each[0] for each in found.values() if isinstance(each, tuple))]
+            try:
+                found[place] = attempt(candidate, known)
+            except checks.FieldError as error:  # of half of the data no model of this kind can be made
+                found[place] = error
+        return found
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FitWarning)
+        for batch in _batches(candidates, transfer):
+            if enough and not _is_sure(batch[0], transfer):
+                continue
+            kinds: dict[type, list[tuple[int, Recipe]]] = {}
+            for place, candidate in enumerate(batch):
+                kinds.setdefault(_model(candidate).kind, []).append((place, candidate))
+            found = {
+                k: v for part in map_in_order(climb, kinds.values(), min(workers, len(kinds))) for k, v in part.items()
+            }
+            for place, candidate in enumerate(batch):
+                if isinstance(found[place], checks.FieldError):
+                    refused = found[place]
+                    continue
+                model, distance, ahead = found[place]
+                chosen.append(candidate)
+                models.append(model)
+                tried.append(Rung(_model(candidate).name, candidate.order, distance))
+                if ahead is not None:
+                    enough[len(tried) - 1] = ahead
+            if enough and not _model(batch[0]).windows:
                 break
-        elif foreseen(halves, missed, halves) @ weight <= record.near:  # not sure to be too far off
-            _, other = fitted(candidate, parts[1], model)
-            back = total_variation(other, means[0]).mean(0)
-            both, spread = (missed + back) / 2, total_variation(found, other).mean(0)
-            ahead = [
-                float(foreseen(*(part[window].mean() for part in (halves, both, spread))))
-                for window in windows(times, record.windows)
-            ]
-            if max(ahead) <= record.near:
-                enough[len(tried) - 1] = sum(ahead) / len(ahead)
     if not tried:
         assert refused is not None, "there is at least one candidate"
         raise refused
