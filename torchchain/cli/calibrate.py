@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import tomli_w
@@ -30,6 +31,9 @@ from torchchain.master.calibration import recipe
 from torchchain.master.ladder import methods
 from torchchain.progress import log
 from torchchain.results import read_transfer
+from torchchain.threads import beside
+
+DATA = "transfer.nc"
 
 
 def run_calibrate(
@@ -86,38 +90,39 @@ def _leave(
     run: Run, transfer: BandTransfer, settings: dict[str, Any], starts: bool, forecast: dict[str, Any] | None,
     source: dict[str, Any], shown: Sequence[int],
 ) -> None:  # fmt: skip
-    """Fit, predict, compare, draw, write and tell."""
+    """Fit, predict, compare, draw, write and tell; the data are written while the model is fitted."""
     stages = run.stages
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        log.info("calibrating on %d bands and %d times", transfer.n_bands, len(transfer.times))
-        with stages("calibration"):
-            master = calibrate(transfer, progress=True, **settings)
-        with stages("prediction"):
-            predicted = master.solve(torch.eye(master.n_bands, dtype=torch.float64), transfer.times).detach()
-        with stages("comparison"):
-            rows = comparison(transfer, master, predicted)
-        log.info("drawing and writing")
-        with stages("figure"):
-            rates = rates_of(transfer, master)
-            figure = calibration_figure(transfer, master, predicted, rates, shown)
-    done = fitted(master)
-    chosen = {**settings, "method": done.method, "model": done.model, "window": list(done.window or ())}
-    chosen |= {} if starts else {"starts": False}
-    scene = [] if transfer.scene is None or "transfer" in source else [transfer.scene.to_toml()]
-    seed = None if transfer.scene is None else transfer.scene.seed
-    files = {
-        "transfer.nc": outputs.dataset(transfer.to_dataset()),
-        "model.safetensors": master.save,
-        **outputs.figures(figure, run.flags.format),
-    }
-    run.warned.extend(str(warning.message) for warning in caught)
-    config = run.config(*scene, tomli_w.dumps({"calibration": chosen}))
-    run.write(
-        files, config, seed=seed, **{**source, "reasons": [*source.get("reasons", []), *_model_reasons(master)]},
-        forecast=forecast, title=title(transfer), summary=dict(rows), measured=measured(transfer, shown, rates),
-        numbers=numbers(transfer, master, predicted),
-    )  # fmt: skip
+    with outputs.staging(run.out) as aside, beside(partial(_save, transfer, aside), torch.get_num_threads()) as saved:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            log.info("calibrating on %d bands and %d times", transfer.n_bands, len(transfer.times))
+            with stages("calibration"):
+                master = calibrate(transfer, progress=True, **settings)
+            with stages("prediction"):
+                predicted = master.solve(torch.eye(master.n_bands, dtype=torch.float64), transfer.times).detach()
+            with stages("comparison"):
+                rows = comparison(transfer, master, predicted)
+            log.info("drawing and writing")
+            with stages("figure"):
+                rates = rates_of(transfer, master)
+                figure = calibration_figure(transfer, master, predicted, rates, shown)
+        done = fitted(master)
+        chosen = {**settings, "method": done.method, "model": done.model, "window": list(done.window or ())}
+        chosen |= {} if starts else {"starts": False}
+        scene = [] if transfer.scene is None or "transfer" in source else [transfer.scene.to_toml()]
+        seed = None if transfer.scene is None else transfer.scene.seed
+        files = {
+            DATA: lambda path: saved(),
+            "model.safetensors": master.save,
+            **outputs.figures(figure, run.flags.format),
+        }
+        run.warned.extend(str(warning.message) for warning in caught)
+        config = run.config(*scene, tomli_w.dumps({"calibration": chosen}))
+        run.write(
+            files, config, aside, seed=seed, **{**source, "reasons": [*source.get("reasons", []), *_model_reasons(master)]},
+            forecast=forecast, title=title(transfer), summary=dict(rows), measured=measured(transfer, shown, rates),
+            numbers=numbers(transfer, master, predicted),
+        )  # fmt: skip
     print(title(transfer))
     run.told(forecast)
     for warning in caught:
@@ -127,6 +132,10 @@ def _leave(
         print(f"{name:<{width}}  {value:.4g}" if isinstance(value, float) else f"{name:<{width}}  {value}")
     print("seconds: " + ", ".join(f"{name} {seconds:.2f}" for name, seconds in stages.seconds.items()))
     print(f"{time.time() - run.began:.1f} s, results in {run.flags.out}")
+
+
+def _save(transfer: BandTransfer, folder: Path) -> None:
+    outputs.dataset(transfer.to_dataset())(folder / DATA)
 
 
 def fitted(master: MasterEquation) -> Calibration:

@@ -84,14 +84,9 @@ def _reported(out: Path) -> Iterator[None]:
         raise checks.fail("out", "be writable", f"{out}: {error.strerror or error}") from None
 
 
-def write(out: str | Path, writers: dict[str, Writer]) -> None:
-    """Write all files aside first, then move them in: a run that dies leaves nothing half-written.
-
-    Args:
-        out: the folder, made with its parents; files of the same names in it are replaced, the record last.
-        writers: for each file name a function that writes to the path it is given.
-    """
-    log.info("writing %s", out)
+@contextmanager
+def staging(out: str | Path) -> Iterator[Path]:
+    """A folder aside for what is written before the rest is known; gone when this ends, whatever :func:`write` did not move."""
     with _reported(Path(out)):
         out = Path(out).absolute()
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -99,22 +94,39 @@ def write(out: str | Path, writers: dict[str, Writer]) -> None:
         aside = out if out.exists() else out.parent
         _clear_staging(aside, out.name)
         prefix = f".{out.name[:100]}.{os.getpid()}-"
-        staging = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=aside))
-        try:
-            for name, writer in writers.items():
-                writer(staging / name)
-            staging.chmod(0o755)
-            if out.exists():
-                if RECORD in writers:  # no old record beside new data
-                    (out / RECORD).unlink(missing_ok=True)
-                for name in writers:
-                    os.replace(staging / name, out / name)
-                staging.rmdir()
-            else:
-                os.rename(staging, out)
-        except BaseException:
-            shutil.rmtree(staging, ignore_errors=True)
-            raise
+        folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=aside))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def write(out: str | Path, writers: dict[str, Writer], aside: Path | None = None) -> None:
+    """Write all files aside first, then move them in: a run that dies leaves nothing half-written.
+
+    Args:
+        out: the folder, made with its parents; files of the same names in it are replaced, the record last.
+        writers: for each file name a function that writes to the path it is given.
+        aside: of :func:`staging` for the same folder, where it was asked for before; writers of files that lie there already
+            wait for them.
+    """
+    log.info("writing %s", out)
+    if aside is None:
+        with staging(out) as folder:
+            write(out, writers, folder)
+        return
+    with _reported(Path(out)):
+        out = Path(out).absolute()
+        for name, writer in writers.items():
+            writer(aside / name)
+        aside.chmod(0o755)
+        if out.exists():
+            if RECORD in writers:  # no old record beside new data
+                (out / RECORD).unlink(missing_ok=True)
+            for name in writers:
+                os.replace(aside / name, out / name)
+        else:
+            os.rename(aside, out)
 
 
 def _clear_staging(folder: Path, name: str) -> None:

@@ -99,15 +99,17 @@ class Run:
         head = [tomli_w.dumps({"plugins": self.plugins})] if self.plugins else []
         return "\n".join([*head, *tables])
 
-    def write(self, files: dict[str, outputs.Writer], config: str, **record: Any) -> None:
-        """Leave the files, the config and the record in the folder, and clear the checkpoint."""
+    def write(
+        self, files: dict[str, outputs.Writer], config: str, aside: Path | None = None, **record: Any
+    ) -> None:  # fmt: skip
+        """Leave the files, the config and the record in the folder, and clear the checkpoint; see :func:`outputs.write`."""
         hashes = {name: outputs.sha256(name) for name in self.plugins if name.endswith(".py")}
         written = outputs.reported(
             self.out, self.arguments, config, self.device, self.began, self.stages.seconds, warnings=self.warned,
             **({"plugins": hashes} if self.plugins else {}), **record,
         )  # fmt: skip
         with self.stages("writing"):
-            outputs.write(self.out, {"config.toml": outputs.text(config), **files, **written})
+            outputs.write(self.out, {"config.toml": outputs.text(config), **files, **written}, aside)
         if self.checkpoint is not None:
             self.checkpoint.clear()
 
