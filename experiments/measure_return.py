@@ -21,7 +21,7 @@ from torchchain.theory import MEASURED, Return, law_of
 from torchchain.theory.crossed import LAST, crossed_transfer, fading
 from torchchain.theory.ladder import Waves, ladder_transfer, spectrum_edges
 from torchchain.theory.localized import Frequencies, first_part, interference, onset, source_frequencies
-from torchchain.theory.transfer import added
+from torchchain.theory.transfer import crossed_part
 
 NAMES = ("narrowing", "onset", "delay", "power", "first")
 EARLY = 8.0  # times up to here weigh as much as all together
@@ -74,8 +74,9 @@ class Disordered:
         fade, change = fading(self.times), []
         for s, (spectrum, pattern) in enumerate(zip(self.spectra, patterns, strict=True)):
             late = onset(self.times, spectrum, numbers).T @ pattern.T
-            part = first_part(self.times, spectrum, numbers) * fade
-            change.append(added(self.ladder[s], self.crossed[s], late, part, numbers))
+            first = first_part(self.times, spectrum, numbers) * fade
+            part = crossed_part(self.ladder[s], self.crossed[s], first, numbers)[:, None]
+            change.append(part * self.crossed[s] + (1 - part) * late)
         return (self.ladder + torch.stack(change) - self.mean).abs().sum(-1).mean(0) / 2
 
 
@@ -91,7 +92,7 @@ def prepared(config: Config, xi: float, device: str) -> Disordered:
     bare = torch.stack([(s.receivers @ s.energy).reshape(config.n_bands, -1).sum(-1) for s in spectra])
     ladder = ladder_transfer(law, waves, t, edges)
     crossed = torch.zeros_like(ladder)
-    crossed[:, t <= LAST] = crossed_transfer(law, waves, t[t <= LAST], edges[0])
+    crossed[:, t <= LAST], _ = crossed_transfer(law, waves, t[t <= LAST], edges[0])
     assert chains.long_time is not None
     return Disordered(waves, k.tolist(), spectra, t, ladder, crossed, bare, chains.mean, chains.long_time)
 

@@ -14,6 +14,7 @@ from torchchain.theory.crossed import crossed_transfer
 from torchchain.theory.ladder import spectrum_edges
 from torchchain.theory.law import law_of
 from torchchain.theory.localized import density_correlation
+from torchchain.theory.mean_wave import mean_resolvent
 from torchchain.theory.medium import coherent_mass, site_resolvent, wavenumber
 from torchchain.theory.transfer import described
 
@@ -159,7 +160,7 @@ def test_transfer_is_that_of_chains(chains):
 
 def crossed(xi, kind="normal"):
     law, waves = described(tc.Disorder(kind=kind, strength=xi), 64, 8, [22, 30], "periodic", None, "linear", 0.0)
-    return crossed_transfer(law, waves, torch.tensor([0.0, 6.0, 12.0], dtype=torch.float64), spectrum_edges(law)[0])
+    return crossed_transfer(law, waves, torch.tensor([0.0, 6.0, 12.0], dtype=torch.float64), spectrum_edges(law)[0])[0]
 
 
 @pytest.mark.parametrize("kind", ["normal", "gamma"])
@@ -189,6 +190,36 @@ def test_theory_is_negative_where_chains_are(chains):
     assert int(below.sum()) > 3
     assert bool((result[below] < 0).all())
     assert bool((result[chains.mean > 3 * chains.stderr + 2e-5] > -2e-5).all())
+
+
+@pytest.mark.parametrize("xi", [0.3, 0.7])
+def test_mean_wave_is_that_of_all_rings_of_two_masses(xi):
+    n = 10  # every one of the 2^10 rings; at this height above the axis a wave does not come around
+    z = torch.tensor([0.4 + 1.0j, 1.5 + 1.0j, 2.2 + 1.0j, 4.0 + 1.0j], dtype=torch.complex128)
+    k = 2 * math.pi / n * torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
+    shift = torch.roll(torch.eye(n, dtype=torch.float64), 1, 0)
+    waves = torch.exp(1j * k[:, None] * torch.arange(n)) / math.sqrt(n)
+    masses = 1 + xi * (2.0 * ((torch.arange(2**n)[:, None] >> torch.arange(n)) & 1).double() - 1)
+    matrix = (2 * torch.eye(n) - shift - shift.T) - z[:, None, None, None] ** 2 * torch.diag_embed(masses)
+    counted = torch.einsum("ki,zij,kj->kz", waves.conj(), torch.linalg.inv(matrix).mean(1), waves)
+    exact, medium = mean_resolvent(z, law_of(tc.Disorder("binary", xi)), k)
+    error = (exact - counted).abs() / counted.abs()
+    assert float(error.max()) < 1e-3
+    assert bool((error[:, 1:3] < 0.1 * ((medium - counted).abs() / counted.abs())[:, 1:3]).all())
+
+
+def test_clusters_of_light_particles_beat():
+    times = torch.tensor([16.0, 40.0, 100.0, 200.0], dtype=torch.float64)
+    disorder = tc.Disorder("binary", 0.5)
+    scene = tc.Scene(n_particles=64, n_bands=8, disorder=disorder, times=times, realizations=200, seed=4)
+    measured, result = tc.band_transfer(scene, "modes").mean, theory_transfer(disorder, 64, 8, times)
+    assert float(distance(result.mean, measured).max()) < 0.025
+    # Of short waves the mean wave itself is left, which no medium of single particles keeps.
+    own = torch.arange(8)
+    excess, theory = ((mean - result.long_time[:, None])[own, :, own] for mean in (measured, result.mean))
+    assert float(excess[5:7, 0].min()) > 0.03
+    assert float((theory - excess)[5:7, 0].abs().max()) < 0.02
+    torch.testing.assert_close(result.mean.sum(-1), torch.ones(8, 4, dtype=torch.float64), rtol=0, atol=1e-9)
 
 
 def test_localization_is_what_the_ladder_lacks_at_late_times(chains):

@@ -74,8 +74,9 @@ class _Side:
         return _Side(*(x.conj().resolve_conj() if conjugate else x for x in parts))
 
 
-def crossed_transfer(law: Law, waves: Waves, times: Tensor, edge: float) -> Tensor:
-    """What crossed scattering adds to the ladder's shares, [source, time, band]; rows add up to 0.
+def crossed_transfer(law: Law, waves: Waves, times: Tensor, edge: float) -> tuple[Tensor, Tensor]:
+    """What crossed scattering adds to the ladder's shares, [source, time, band], rows adding up to 0, and what of it is the mean wave's,
+    [source, time].
 
     Args:
         law: of the masses.
@@ -104,8 +105,10 @@ def crossed_transfer(law: Law, waves: Waves, times: Tensor, edge: float) -> Tens
     found = found * (4 * stretch.step**2 / (2 * math.pi) ** 2 * source_scale(law, waves))[:, None, None]
     # The coherent energy is quadratic in the mean amplitudes: half the difference of both signs is its linear change.
     more, less = (coherent_energy(law, waves, times, stretch, side.z, mean, side.loss, side.window) for mean in means)
-    found[torch.arange(len(found)), :, waves.source_bands] += (more - less) / 2
-    return found * (times > 0)[:, None]  # nothing has been scattered at t = 0, which wide spectra miss by 2e-5
+    coherent = (more - less) / 2
+    found[torch.arange(len(found)), :, waves.source_bands] += coherent
+    begun = times > 0  # nothing has been scattered at t = 0, which wide spectra miss by 2e-5
+    return found * begun[:, None], coherent * begun
 
 
 def fading(times: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from torchchain.theory.localized import (
     onset,
     source_frequencies,
 )
+from torchchain.theory.mean_wave import MOST_VALUES, mean_wave_energy
 from torchchain.threads import single_thread
 
 LATEST_TIME = 5000.0
@@ -141,11 +142,14 @@ def transfer_of_law(
         long_error = torch.zeros(sources, dtype=torch.float64)
         error = torch.zeros(sources, len(times), dtype=torch.float64)
         early = times <= LAST
-        crossed = torch.zeros(sources, len(times), n_bands, dtype=torch.float64)
+        crossed, coherent = torch.zeros(sources, len(times), n_bands, dtype=torch.float64), torch.zeros_like(error)
         if localization and bool(early.any()) and law.variance > 0:
-            crossed[:, early] = crossed_transfer(law, waves, times[early], edges[0])
+            crossed[:, early], coherent[:, early] = crossed_transfer(law, waves, times[early], edges[0])
             if damping == 0:  # rounding
                 crossed[torch.arange(sources), :, waves.source_bands] -= crossed.sum(-1)
+        sharp = localization and 1 < len(law.values) <= MOST_VALUES and isinstance(waves.ring, int)
+        if sharp:
+            medium, exact = mean_wave_energy(law, waves, times)
         for s, (plain, pattern, change, doubt, first) in enumerate(_returns(law, waves, times, edges[0], numbers)):
             if bool(late.any()):
                 mean[s, late] = _faded(
@@ -153,7 +157,10 @@ def transfer_of_law(
                 )
             error[s] = doubt
             if localization:
-                mean[s] += added(mean[s], crossed[s], change, first * fading(times), numbers)
+                part = crossed_part(mean[s], crossed[s], first * fading(times), numbers)
+                mean[s] += part[:, None] * crossed[s] + (1 - part)[:, None] * change
+                if sharp:
+                    _exchange(mean[s], int(waves.source_bands[s]), medium[s] + part * coherent[s], exact[s])
             else:
                 error[s] += _distance(change)
             if damping == 0:
@@ -201,13 +208,21 @@ def _faded(ladder: Tensor, settled: Tensor, times: Tensor) -> Tensor:
     return settled + rest[1] * torch.exp(-rate * (times - FADING))[:, None]
 
 
-def added(ladder: Tensor, crossed: Tensor, change: Tensor, first: Tensor, numbers: Return) -> Tensor:
-    """What interference adds to the ladder, (time, band): two particles' as far as it is a small correction, and bands have
-    the energy (_SLACK aside), and for the rest that of localized modes."""
+def crossed_part(ladder: Tensor, crossed: Tensor, first: Tensor, numbers: Return) -> Tensor:
+    """Part of the interference that is two particles', (time,): as far as it is a small correction, and bands have the energy
+    (_SLACK aside); the rest is that of localized modes."""
     spare = ladder.clamp(min=0) + _SLACK
     room = torch.where(crossed < 0, spare / (-crossed).clamp(min=1e-300), math.inf).amin(-1)
-    part = torch.minimum(first / (1 + (_distance(crossed) / numbers.most) ** 4), room)[:, None]
-    return part * crossed + (1 - part) * change
+    return torch.minimum(first / (1 + (_distance(crossed) / numbers.most) ** 4), room)
+
+
+def _exchange(mean: Tensor, band: int, held: Tensor, exact: Tensor) -> None:
+    """Give the mean wave (time,) in its band its exact energy, at the cost of what has been scattered, (time, band)."""
+    mean[:, band] -= held
+    scattered = mean.sum(-1)
+    change = torch.minimum(exact - held, scattered.clamp(min=0))
+    mean *= (1 - change / scattered.clamp(min=1e-300))[:, None]
+    mean[:, band] += held + change
 
 
 def _distance(change: Tensor) -> Tensor:
