@@ -167,11 +167,11 @@ CALLS = {
     "particle_energy": Call(tc.particle_energy, lambda: {"chain": chain(), "trajectory": trajectory(), "definition": "bond"}),
     "plan": Call(tc.plan, lambda: {"scene": scene(), "artifact": None}, {"artifact": ("file",)}, infinite=True),
     "potential_energy": Call(tc.potential_energy, lambda: {"chain": chain(), "trajectory": trajectory(), "definition": "site"}),
-    "Network": Call(tc.Network, {"masses": [1.0, 1.0, 2.0], "positions": [[0.0, 0.0], [1.0, 0.0], [0.5, 0.8]], "bonds": [[0, 1], [1, 2], [2, 0]], "stiffness": 1.0, "tension": 0.0, "box": None, "motion": "vector"}, {"masses": ("positions", "bonds"), "positions": ("masses", "bonds")}),
+    "Network": Call(tc.Network, {"masses": [1.0, 1.0, 2.0], "positions": [[0.0, 0.0], [1.0, 0.0], [0.5, 0.8]], "bonds": [[0, 1], [1, 2], [2, 0]], "stiffness": 1.0, "tension": 0.0, "box": None, "motion": "vector"}, {"masses": ("positions", "bonds"), "positions": ("masses", "bonds")}, infinite=True),  # a box is endless along an open axis
     "estimate_disorder": Call(tc.estimate_disorder, lambda: {"transfer": small_transfer(), "kind": "normal", "lower": 0.05, "guess": 0.2}, {"kind": ("disorder",), "lower": ("disorder",)}),
     "lattice": Call(tc.lattice, {"kind": "square", "shape": (3, 4), "motion": "scalar", "boundary": "periodic"}),
     "open": Call(tc.open, {"folder": "nothing"}),
-    "packing": Call(tc.packing, {"positions": [[0.0, 0.0], [0.9, 0.0], [0.4, 0.8]], "radii": [0.5, 0.5, 0.5], "masses": [1.0, 1.0, 1.0], "box": None, "stiffness": 1.0, "contact": "linear"}, {"radii": ("positions",), "masses": ("positions",), "positions": ("radii", "masses")}),
+    "packing": Call(tc.packing, {"positions": [[0.0, 0.0], [0.9, 0.0], [0.4, 0.8]], "radii": [0.5, 0.5, 0.5], "masses": [1.0, 1.0, 1.0], "box": None, "stiffness": 1.0, "contact": "linear"}, {"radii": ("positions",), "masses": ("positions",), "positions": ("radii", "masses")}, infinite=True),  # a box is endless along an open axis
     "paper_rates": Call(lambda **k: tc.paper_rates(**k).rates.values, lambda: {"transfer": transfer(), "window": (0.5, 2.0)}),
     "read_frames": Call(tc.read_frames, {"path": "nothing", "contacts": None, "format": None}, {"contacts": ("nothing",), "format": ("nothing",)}),
     "simulate": Call(tc.simulate, lambda: {"scene": scene(realizations=2), "method": "modes", **RUN, "checkpoint": None}),
