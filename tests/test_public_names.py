@@ -35,6 +35,7 @@ def test_unknown_names():
         _ = tc.Chains
     except AttributeError as error:
         assert str(error) == "module 'torchchain' has no attribute 'Chains'"
+        assert (error.name, error.obj) == ("Chains", tc), "for Python's own suggestion"
     else:
         raise AssertionError("an unknown name must be an AttributeError")
 

@@ -230,6 +230,10 @@ def test_unreadable_files(tmp_path):
 def test_a_misspelled_field_names_the_one_meant():
     with pytest.raises(tc.FieldTypeError, match="a scene has no field 'n_particle'; did you mean n_particles?"):
         tc.Scene(n_particle=8)
+    with pytest.raises(tc.FieldTypeError, match="a disorder has no field 'xi'; did you mean strength?"):
+        tc.Disorder(xi=0.3)
+    with pytest.raises(tc.FieldTypeError, match="an impulse has no field 'position'; did you mean site?"):
+        tc.Impulse(position=3)
     scene = tc.Scene(n_particles=8, n_bands=2)
     assert copy.deepcopy(scene).to_dict() == pickle.loads(pickle.dumps(scene)).to_dict() == scene.to_dict()
 

@@ -38,7 +38,10 @@ def __getattr__(name: str) -> Any:
     if name in ("__all__", "_HOME", "_ROOMS"):
         return globals()[name]
     if name not in globals()["_HOME"]:
-        raise AttributeError(f"module 'torchchain' has no attribute '{name}'")
+        from sys import modules
+
+        words = f"module 'torchchain' has no attribute '{name}'"
+        raise AttributeError(words, name=name, obj=modules[__name__])  # Python then says what may be meant
     home, original = globals()["_HOME"][name]
     module = None if home == __name__ else import_module(home)
     value = getattr(module, original, None) or import_module(f"{home}.{original}")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import numbers
+import re
 from collections.abc import Callable, Iterable
-from typing import Any, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 import torch
@@ -36,6 +38,22 @@ class FieldTypeError(TypeError):
         ...     print(error)
         disorder.strength must be a number, got 'weak'
     """
+
+
+class Fields:
+    """A dataclass whose misspelled fields are errors that name the ones most likely meant."""
+
+    if not TYPE_CHECKING:  # type checkers know the fields
+
+        def __new__(cls, *_: Any, **given: Any) -> Any:
+            """See the class."""
+            names = [each.name for each in dataclasses.fields(cls) if each.init]
+            for name in given:
+                if name not in names:
+                    kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", cls.__name__).lower()
+                    article = "an" if kind[0] in "aeiou" else "a"
+                    raise FieldTypeError(f"{article} {kind} has no field {name!r}{suggestion(name, names)}")
+            return super().__new__(cls)
 
 
 def shown(value: Any, width: int = 80) -> str:

@@ -14,7 +14,7 @@ CONTACTS = ("linear", "hertz")
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class Chain(checks.Fields):
     """Chains of beads, each in contact with its two neighbors; a batch shares boundary and contact law.
 
     Units: mean mass 1, contact stiffness 1, initial overlap 1, so that sound travels one particle per unit time.

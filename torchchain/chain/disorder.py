@@ -20,7 +20,7 @@ _NEGLIGIBLE = 1e-20  # a strength below the resolution of a float64 next to 1
 
 
 @dataclass(frozen=True)
-class Disorder:
+class Disorder(checks.Fields):
     """Independent random values of mean 1 and standard deviation xi (Section 2.7).
 
     A value below ``lower`` is drawn again, so that the values follow the distribution cut off at ``lower``; a

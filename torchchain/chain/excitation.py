@@ -105,7 +105,7 @@ def _size(field: str, value: float) -> float:
 
 
 @dataclass(frozen=True)
-class Impulse:
+class Impulse(checks.Fields):
     """What a scene says of an impulse; see :func:`impulse`.
 
     Attributes:
@@ -134,7 +134,7 @@ class Impulse:
 
 
 @dataclass(frozen=True)
-class StandingWave:
+class StandingWave(checks.Fields):
     """What a scene says of standing waves; see :func:`standing_wave`. Each tone is a wave of its own.
 
     ``tones=None`` is the center tone of every band, (s - 1/2) N / (2 B) rounded up: 2, 6, ..., 126 for N = 256, B = 32.

@@ -14,7 +14,7 @@ QUANTITIES = ("time", "length", "velocity", "mass", "force", "energy", "stiffnes
 
 
 @dataclass(frozen=True)
-class Scaling:
+class Scaling(checks.Fields):
     """A chain of equal elastic spheres under a precompression force, and the units it sets.
 
     Two spheres of radius a in contact push with F = kappa delta^(3/2), kappa = E sqrt(2 a) / (3 (1 - nu^2)) (Hertz; Johnson,

@@ -7,8 +7,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
-from typing import Any
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # nothing that takes time before signals are heard
+    from collections.abc import Sequence
+    from typing import Any
 
 __all__ = ["main"]
 

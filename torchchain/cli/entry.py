@@ -47,6 +47,7 @@ def command(arguments: list[str], signals: bool = False) -> int:
         return stop.code if isinstance(stop.code, int) else 2
     with _one_line_warnings(), _notices(), _ends() as ends:
         try:
+            logging.getLogger("torchchain").info("loading")
             from torchchain.checks import FieldError, FieldTypeError
             from torchchain.cli import dispatch  # torch and the rest, once the flags are known to be good
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import tomli_w
 import torch
@@ -39,7 +39,6 @@ from torchchain.network.lattices import Lattice
 from torchchain.network.random_lattices import RandomLattices
 from torchchain.species.energy import species_waves
 from torchchain.species.mixtures import MixedChain, Mixture, Species
-from torchchain.spelling import suggestion
 
 System = TypeVar("System", Lattice, MixedChain)
 LARGEST_CHAIN = 10**8
@@ -47,7 +46,7 @@ LATEST_TIME = 1e12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Scene(Printed):
+class Scene(Printed, checks.Fields):
     """An ensemble of chains or lattices, how they are set in motion, and what is to be measured.
 
     The defaults are the paper's. With ``lattice`` the scene is of lattices, and of the fields of chains ``contact`` is
@@ -144,16 +143,6 @@ class Scene(Printed):
     arrangement: str = "random"
     unlike: tuple[float, float] | str | None = None
     by_species: bool = False
-
-    if not TYPE_CHECKING:  # type checkers know the fields
-
-        def __new__(cls, *_: Any, **given: Any) -> Scene:
-            """A misspelled field is an error that names the one most likely meant."""
-            names = [each.name for each in fields(cls)]
-            for name in given:
-                if name not in names:
-                    raise checks.FieldTypeError(f"a scene has no field {name!r}{suggestion(name, names)}")
-            return super().__new__(cls)
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:

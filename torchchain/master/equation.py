@@ -132,10 +132,10 @@ class MasterEquation(Printed, nn.Module):
         return self.model.n_bands
 
     def _rows(self) -> dict[str, str]:
-        rows = {"bands": f"{self.n_bands}", "model": f"{self.model.kind}: {self.model.words}"}
+        rows = {"model": f"{self.model.kind}: {self.model.words}; {self.n_bands} bands"}
         record, scene = self.calibration, self.calibration.scene
         if record.method != "given":
-            rows["model"] = f"{record.model}, fitted by {record.method}: {self.model.words}"
+            rows["model"] = f"{record.model}, fitted by {record.method}: {self.model.words}; {self.n_bands} bands"
             rows["calibrated on"] = (
                 describe(scene) if scene is not None else record.provenance or "data without a scene"
             )
@@ -153,9 +153,8 @@ class MasterEquation(Printed, nn.Module):
             )
         if bool(self.damping.any()):
             rows["damping"] = f"{float(self.damping.min()):.3g} to {float(self.damping.max()):.3g} per unit time"
-        if self.calibration.report.certificate is not None:
-            rows["energies"] = "never negative, proved for all times"
-        rows["conservation defect"] = f"{self.conservation_defect:.1e}"
+        sure = "never negative, proved for all times; " if self.calibration.report.certificate is not None else ""
+        rows["energies"] = f"{sure}conservation defect {self.conservation_defect:.1e}"
         return rows | {"rates": self.rates_meaning}
 
     def solve(self, initial: Any, times: Any, method: str = "expm", *, supply: Any = None, **options: Any) -> Tensor:

@@ -19,7 +19,7 @@ _SPECIES = 3  # a random stream of a realization beside those of masses, stiffne
 
 
 @dataclass(frozen=True)
-class Species:
+class Species(checks.Fields):
     """Beads of one kind.
 
     With a radius, mass and stiffness are those of an elastic sphere in units of a reference bead: the mass is
