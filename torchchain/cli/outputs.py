@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 PACKAGES = ("torchchain", "torch", "numpy", "scipy", "torchdiffeq", "safetensors", "xarray", "h5netcdf", "matplotlib")
 COMPRESSION: dict[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True}
+DPI = 200
 RECORD = "run.json"
 """Written last and removed first: where it is, all that it names is of one run."""
 Writer = Callable[[Path], None]
@@ -184,7 +185,12 @@ def figure(drawn: Any) -> Writer:
 
     def writer(path: Path) -> None:
         with plots.style():  # colors and ticks are made as it is drawn
-            drawn.savefig(path, dpi=200)
+            layout = drawn.get_layout_engine()
+            if layout is not None:  # laid out here, once: to save it so would draw all of it a second time
+                drawn.set_dpi(DPI)
+                layout.execute(drawn)
+                drawn.set_layout_engine(None)
+            drawn.savefig(path, dpi=DPI)
 
     return writer
 

@@ -29,7 +29,7 @@ from torchchain.ensemble.transfer_fields import late_average, of_moments
 from torchchain.theory.lattices import lattice_transfer
 from torchchain.theory.law import law_of
 from torchchain.theory.transfer import theory_transfer
-from torchchain.threads import single_thread
+from torchchain.threads import beside, single_thread
 
 THEORY = "theory"
 """The method of a transfer without chains."""
@@ -98,14 +98,19 @@ def band_transfer(
         replace(scene, observables=observables), method,
         min(BLOCKS, scene.distinct_realizations // scene.sample_size), options=options, checkpoint=checkpoint, **settings,
     )  # fmt: skip
-    with single_thread(), stages("statistics"):
-        found = BandTransfer(**of_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None))
-        found = _by_species(found, ensemble.moments) if scene.by_species else found
-        found = with_late_average(found) if long_time and len(observables) == 1 else found
+
+    def measured() -> BandTransfer:
+        with single_thread(), stages("statistics"):
+            found = BandTransfer(**of_moments(scene, scene.times, ensemble.moments, ensemble.attributes, None))
+            found = _by_species(found, ensemble.moments) if scene.by_species else found
+            return with_late_average(found) if long_time and len(observables) == 1 else found
+
     if not starts or not measurable(scene):
-        return found
+        return measured()
     other = None if checkpoint is None else Checkpoint(checkpoint.folder / "starts", checkpoint.every)
-    return replace(found, starts=start_transfer(scene, ensemble.method, ensemble.options, other, **settings))
+    with beside(measured, torch.get_num_threads()) as found:
+        moved = start_transfer(scene, ensemble.method, ensemble.options, other, **settings)
+    return replace(found(), starts=moved)
 
 
 def _by_species(transfer: BandTransfer, moments: EnsembleMoments) -> BandTransfer:
