@@ -25,12 +25,6 @@ COLORS = ("#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00", "#cc
 DASHES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)))
 
 
-def load() -> None:
-    """Import what figures are drawn with, which takes a third of a second, while something else goes on."""
-    import matplotlib.backends.backend_agg
-    import matplotlib.figure  # noqa: F401
-
-
 @contextmanager
 def style() -> Iterator[None]:
     """Sizes for print while a figure is drawn: eight points, thin frames, colors and dashes that gray does not confuse."""

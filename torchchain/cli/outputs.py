@@ -39,6 +39,11 @@ RECORD = "run.json"
 Writer = Callable[[Path], None]
 
 
+def load() -> None:
+    """Import what results are drawn and written with, half a second, while something else goes on."""
+    import xarray  # noqa: F401
+
+
 @contextmanager
 def run_folder(out: str | Path) -> Iterator[Path]:
     """The output folder, found writable before hours of work and held against other runs until this one ends."""

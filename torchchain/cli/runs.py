@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import tomli_w
 import torch
 
-from torchchain import checks, plots
+from torchchain import checks
 from torchchain.cli import choices, outputs, plugins
 from torchchain.cli.flags import Calibrate, RunFlags, SceneFlags
 from torchchain.ensemble import plan as planning
@@ -69,7 +69,7 @@ class Run:
 
     def measured(self, measure: Callable[..., Measured], scene: Scene) -> Measured | None:
         """What :func:`simulate` or :func:`band_transfer` finds, on the first of the processes that share the work."""
-        with beside(plots.load, torch.get_num_threads()), ranks.process_group(self.device) as self.group:
+        with beside(outputs.load, torch.get_num_threads()), ranks.process_group(self.device) as self.group:
             before = time.time()
             found = measure(
                 scene, self.flags.method, device=self.device, progress=True, stages=self.stages, options=self.options,

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray
 
 from torchchain import checks
+
+if TYPE_CHECKING:
+    import xarray
 
 BAND_AXES = ("band", "receiver")
 
@@ -85,6 +88,8 @@ def compare(a: xarray.Dataset, b: xarray.Dataset) -> list[Agreement]:
 
 def _difference(a: xarray.Dataset, b: xarray.Dataset, variable: str) -> tuple[xarray.DataArray, xarray.DataArray]:
     """a - b and its standard error where both have coordinates."""
+    import xarray
+
     if set(a[variable].dims) != set(b[variable].dims):
         raise checks.fail(
             f"{variable} of the second result", f"have the axes {a[variable].dims}", f"{b[variable].dims}"
@@ -96,6 +101,8 @@ def _difference(a: xarray.Dataset, b: xarray.Dataset, variable: str) -> tuple[xa
 
 
 def _with_error(data: xarray.Dataset, variable: str) -> xarray.Dataset:
+    import xarray
+
     value = data[variable]
     error = data[f"{variable}_stderr"] if f"{variable}_stderr" in data else xarray.zeros_like(value)
     return xarray.Dataset({"value": value, "error": error})

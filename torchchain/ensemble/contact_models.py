@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from scipy.optimize import brentq
+import scipy
 
 from torchchain import checks
 
@@ -82,4 +82,4 @@ def _edge(error: Callable[[float, float], float], end: float, tolerance: float) 
     top = OPENING if math.isinf(error(1.0, end)) else 1.0
     if error(top, end) <= tolerance:
         return top
-    return float(brentq(lambda a: error(a, end) - tolerance, 0.0, top, xtol=1e-12))
+    return float(scipy.optimize.brentq(lambda a: error(a, end) - tolerance, 0.0, top, xtol=1e-12))

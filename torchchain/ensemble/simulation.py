@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-import xarray
 
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.checkpoint import Checkpoint
@@ -18,6 +17,9 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.statistics import Moments, merged
 from torchchain.threads import single_thread
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def simulate(
@@ -66,6 +68,8 @@ def simulate(
 
 
 def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, Any]) -> xarray.Dataset:
+    import xarray
+
     leading = ("tone",) if scene.tones else ()
     variables: dict[str, Any] = {}
     used: set[str] = set()

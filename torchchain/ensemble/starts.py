@@ -10,11 +10,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import xarray
 from torch import Tensor
 
 from torchchain import checks
@@ -25,6 +24,9 @@ from torchchain.ensemble.labels import ordered_error
 from torchchain.ensemble.run import ensemble_moments
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import merged
+
+if TYPE_CHECKING:
+    import xarray
 
 FEWEST = 16
 """Independent samples of a scene from which on other starts are measured."""

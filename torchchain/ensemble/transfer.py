@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-import xarray
 from torch import Tensor
 
 from torchchain import checks, plots
@@ -26,6 +25,7 @@ from torchchain.ensemble.transfer_data import dataset_of, fields_of
 from torchchain.network import Network
 
 if TYPE_CHECKING:
+    import xarray
     from matplotlib.axes import Axes
 
 
@@ -232,6 +232,8 @@ class BandTransfer(Printed):
         Raises:
             FieldError: if the file is not one.
         """
+        import xarray
+
         checks.instance("path", path, str, Path)
         try:
             with xarray.open_dataset(path, engine="h5netcdf") as data:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import xarray
 from torch import Tensor
 
 from torchchain import checks
@@ -20,6 +19,8 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.starts import StartTransfer
 
 if TYPE_CHECKING:
+    import xarray
+
     from torchchain.ensemble.transfer import BandTransfer
 
 OF_RUNS = ("mass_mean", "mass_sd", "start_condition")
@@ -28,6 +29,8 @@ OF_RUNS = ("mass_mean", "mass_sd", "start_condition")
 
 def dataset_of(transfer: BandTransfer) -> xarray.Dataset:
     """Variables, coordinates and attributes of a transfer."""
+    import xarray
+
     s, t, r, b = "source", "time", "receiver", "block"
     variables: dict[str, Any] = {}
 
@@ -73,6 +76,8 @@ def dataset_of(transfer: BandTransfer) -> xarray.Dataset:
 
 def fields_of(data: xarray.Dataset) -> dict[str, Any]:
     """The fields of the transfer that a dataset holds, checked."""
+    import xarray
+
     checks.instance("data", data, xarray.Dataset)
     whole = "block_steps" in data
     needed = ("band_energy", "band_energy_stderr", "block_steps" if whole else "block_band_energy", "block_count")

@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import h5netcdf
-import h5py
 import numpy as np
 
 from torchchain import checks
@@ -32,6 +30,8 @@ WORDS = {
 
 def write(out: Path, frames: Iterable[Frame], source: str, units: str | None) -> None:
     """Frames into a new file at ``out``, a block of them at a time."""
+    import h5netcdf
+
     with h5netcdf.File(out, "w") as file:
         file.attrs["layout"] = LAYOUT
         file.attrs["source"] = source
@@ -130,6 +130,8 @@ def _append(file: Any, done: int, frames: list[Frame]) -> None:
 @contextmanager
 def _open(path: Path) -> Iterator[Any]:
     """The file, by h5py, whose access to a part of a variable is a hundred times quicker than h5netcdf's."""
+    import h5py
+
     try:
         file = h5py.File(path, "r")
     except Exception as error:  # h5py lets through many kinds for a damaged file

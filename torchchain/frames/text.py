@@ -13,7 +13,6 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 import numpy as np
-import pandas
 
 from torchchain import checks
 
@@ -237,6 +236,8 @@ def parse(
     Raises:
         FieldError: for a row with more or fewer columns, or a value that is no finite number, naming row and column.
     """
+    import pandas
+
     parts: dict[str, list[np.ndarray]] = {name: [] for name in columns if name in wanted}
     kinds = {i: np.int64 if name in integers else np.float64 for i, name in enumerate(columns) if name in wanted}
     last, done = len(columns) - 1, 0

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy import optimize
 from torch import Tensor
 
 from torchchain import checks
@@ -190,11 +190,11 @@ def _exponential(t: np.ndarray, y: np.ndarray, level: float) -> tuple[float, flo
     t0 = float(np.clip((level - line[1]) / line[0], 0.0, t[0]))
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("error", optimize.OptimizeWarning)
-            best, covariance = optimize.curve_fit(
+            warnings.simplefilter("error", scipy.optimize.OptimizeWarning)
+            best, covariance = scipy.optimize.curve_fit(
                 curve, t, y, p0=(line[0], -0.5 / (t[-1] - t[0]), t0), jac=jacobian, maxfev=200
             )
-    except (RuntimeError, ValueError, optimize.OptimizeWarning):
+    except (RuntimeError, ValueError, scipy.optimize.OptimizeWarning):
         return None
     error = float(np.sqrt(max(covariance[0, 0], 0.0)))
     return float(best[0]), float(best[1]), float(best[2]), error if math.isfinite(error) else math.inf

@@ -8,7 +8,7 @@ left of one mode. So it is never negative, never grows, and starts as flat as th
 from __future__ import annotations
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 MODES = 48
 FASTEST = 4.0
@@ -54,5 +54,5 @@ def mixture(left: np.ndarray, damping: float, times: np.ndarray) -> np.ndarray:
         rows = np.vstack(
             [parts * weight[:, None], np.full(parts.shape[1], 1e4)]
         )  # the last row: all of it at the start
-        found[source], _ = optimize.nnls(rows, np.append(values * weight, 1e4))
+        found[source], _ = scipy.optimize.nnls(rows, np.append(values * weight, 1e4))
     return found / found.sum(1, keepdims=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import scipy
 import torch
-from scipy import optimize
 from torch import Tensor
 
 from torchchain import checks
@@ -226,7 +226,7 @@ def _push(directions: np.ndarray, short: np.ndarray, margin: np.ndarray) -> np.n
         system = np.vstack([(rows / size[:, None]).T, needed / scale])
         target = np.zeros(len(system))
         target[-1] = 1.0
-        multipliers, _ = optimize.nnls(system, target, maxiter=100 * len(cuts))
+        multipliers, _ = scipy.optimize.nnls(system, target, maxiter=100 * len(cuts))
         rest = target - system @ multipliers
         if not rest[-1] > 0:  # the constraints contradict each other
             break

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import xarray
 
 from torchchain import checks
 from torchchain.ensemble.statistics import jackknife_error
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import checked_window, linear_weights
 from torchchain.master.sample import Sample, paper_basis
+
+if TYPE_CHECKING:
+    import xarray
 
 WINDOW = (0.5, 2.0)
 
@@ -64,6 +67,8 @@ def paper_rates(
         stderr = jackknife_error(slopes((parts.sum(0) - parts) / (counts.sum() - counts)[:, None, None, None]))
     bands = np.arange(1, transfer.n_bands + 1)
     unit = {"units": "1 / travel time of sound over one particle"}
+    import xarray
+
     return xarray.Dataset(
         {
             "rates": (("source", "receiver"), rates.numpy(), {**unit, "long_name": "transfer rate Q, procedure L with Psi of Eq. 47"}),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 SLOWEST, FASTEST = 1e-4, 6.0
 """Decay rates and frequencies, per unit time."""
@@ -110,7 +110,7 @@ class Projection:
         """The poles of the least misfit nearby, half its square, and whether the search ended by itself."""
         order = poles.order
         low = np.log(np.concatenate([np.full(sum(order), SLOWEST), np.full(order[1], SLOWEST_TURN)]))
-        found = optimize.least_squares(
+        found = scipy.optimize.least_squares(
             lambda p: self.amplitudes(Poles.of(p, order))[1].ravel(), poles.logarithms,
             jac=lambda p: self.jacobian(Poles.of(p, order)), bounds=(low, np.log(FASTEST)),
             ftol=1e-6, xtol=1e-6, gtol=1e-12, max_nfev=steps,

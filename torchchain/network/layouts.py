@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
+import scipy
 import torch
-from scipy.sparse import coo_matrix, csgraph
 from torch import Tensor
 
 from torchchain.network.lattices import PRIMITIVE, STEPS, Lattice
@@ -56,8 +56,8 @@ class Gathered:
         self.order = np.arange(n)
         if n > RENUMBER:
             near = end < n
-            graph = coo_matrix((np.ones(near.sum(), np.int8), (owner[near], end[near])), shape=(n, n)).tocsr()
-            self.order = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
+            graph = scipy.sparse.coo_matrix((np.ones(near.sum(), np.int8), (owner[near], end[near])), shape=(n, n)).tocsr()
+            self.order = scipy.sparse.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
         neighbors = np.bincount(owner, minlength=n)[self.order]
         window = np.arange(n) // WINDOW
         sort = np.lexsort((-neighbors, window))

@@ -6,9 +6,8 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.sparse import csgraph, csr_matrix, diags, identity
-from scipy.sparse import linalg as sparse_linalg
 from torch import Tensor
 
 from torchchain import checks
@@ -201,8 +200,8 @@ def components(network: Network) -> Tensor:
     bonds = network.bonds.cpu().numpy()
     held = (torch.as_tensor(network.stiffness).detach() > 0).reshape(-1, network.n_bonds).any(0).cpu().numpy()
     i, j = np.minimum(bonds, n).T[:, held] if len(bonds) else np.zeros((2, 0), np.int64)
-    graph = csr_matrix((np.ones(len(i)), (i, j)), shape=(n + 1, n + 1))
-    _, label = csgraph.connected_components(graph, directed=False)
+    graph = scipy.sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(n + 1, n + 1))
+    _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     _, label = np.unique(label[:n], return_inverse=True)
     return torch.from_numpy(label.reshape(-1)).to(network.bonds.device)
 
@@ -256,7 +255,7 @@ def check_stability(network: Network) -> None:
     for member in np.ndindex(*network.batch_shape):
         matrix = network.sparse_stiffness(member)
         masses = network.masses.detach()[member].double().cpu().numpy().repeat(network.n_components)
-        weight = diags(masses**-0.5)
+        weight = scipy.sparse.diags(masses**-0.5)
         matrix = (weight @ matrix @ weight).tocsc()
         slack = 1e-10 * float(bounds[member])
         if len(masses) <= MOST_DENSE:
@@ -266,9 +265,9 @@ def check_stability(network: Network) -> None:
             continue
         if len(masses) > MOST_FACTORED:
             continue
-        negative = _negative_pivots(matrix + slack * identity(len(masses), format="csc"))
+        negative = _negative_pivots(matrix + slack * scipy.sparse.identity(len(masses), format="csc"))
         if negative:
-            lowest = sparse_linalg.eigsh(
+            lowest = scipy.sparse.linalg.eigsh(
                 matrix, k=1, which="SA", return_eigenvectors=False, tol=1e-3, v0=np.cos(np.arange(1.0, 1 + len(masses)))
             )
             raise _unstable(float(lowest[0]), negative, member)
@@ -280,13 +279,13 @@ def exceeds(network: Network, squared: float, member: tuple[int, ...] = ()) -> b
     None does exactly where the number times M, less K, has no negative eigenvalue.
     """
     masses = network.masses.detach()[member].double().cpu().numpy().repeat(network.n_components)
-    matrix = squared * (1 + 1e-10) * diags(masses) - network.sparse_stiffness(member)
+    matrix = squared * (1 + 1e-10) * scipy.sparse.diags(masses) - network.sparse_stiffness(member)
     return _negative_pivots(matrix.tocsc()) > 0
 
 
-def _negative_pivots(matrix: csr_matrix) -> int:
+def _negative_pivots(matrix: scipy.sparse.csr_matrix) -> int:
     """Negative eigenvalues of a symmetric matrix, by elimination without exchange of rows."""
-    factors = sparse_linalg.splu(
+    factors = scipy.sparse.linalg.splu(
         matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
     return int((factors.U.diagonal() < 0).sum())

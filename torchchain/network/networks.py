@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy import sparse
 from torch import Tensor
 
 from torchchain import checks
@@ -34,7 +34,8 @@ class Network:
     Displacements, velocities and forces have the axes (*batch, *any, particle, component): as many components as
     dimensions for motion "vector", one for "scalar".
 
-    >>> import torch
+    >>> import scipy
+import torch
     >>> triangle = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 0.75**0.5]], dtype=torch.float64)
     >>> network = Network(torch.ones(3), triangle, [[0, 1], [1, 2], [2, 0]])
     >>> network.n_particles, network.n_bonds, network.dimension
@@ -312,7 +313,7 @@ class Network:
         matrix = matrix.reshape(*self.batch_shape, all_points, all_points, c, c)[..., :n, :n, :, :]
         return matrix.transpose(-3, -2).reshape(*self.batch_shape, n * c, n * c)
 
-    def sparse_stiffness(self, member: tuple[int, ...] = ()) -> sparse.csr_matrix:
+    def sparse_stiffness(self, member: tuple[int, ...] = ()) -> scipy.sparse.csr_matrix:
         """K of one network of the batch as a SciPy matrix (unknown, unknown), for products and factorizations.
 
         Args:
@@ -320,7 +321,7 @@ class Network:
         """
         return next(self._sparse([member])).tocsr()
 
-    def _sparse(self, members: Iterable[tuple[int, ...]]) -> Iterator[sparse.bsr_matrix]:
+    def _sparse(self, members: Iterable[tuple[int, ...]]) -> Iterator[scipy.sparse.bsr_matrix]:
         """K of some networks of the batch in blocks of a particle's components, those of a pair as often as it has bonds."""
         n, c = self.n_particles, self.n_components
         first, second = self.bonds.cpu().unbind(-1)
@@ -337,7 +338,7 @@ class Network:
             blocks = every[member].double().cpu()
             ends = blocks.new_zeros(n + self.n_anchors, c, c).index_add(0, first, blocks).index_add(0, second, blocks)
             data = torch.cat([ends[:n], -blocks]).numpy()[which]
-            yield sparse.bsr_matrix((data, columns, starts), shape=(n * c, n * c))
+            yield scipy.sparse.bsr_matrix((data, columns, starts), shape=(n * c, n * c))
 
     def squared_frequency_bound(self, sweeps: int = SWEEPS) -> Tensor:
         """A rigorous upper bound on every |w^2|, (*batch,), float64.

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy import spatial
 from torch import Tensor
 
 from torchchain import checks
@@ -66,7 +66,8 @@ def packing(
 ) -> Packing:
     """The network of the contacts of overlapping disks or spheres.
 
-    >>> import torch
+    >>> import scipy
+import torch
     >>> x = torch.tensor([[0.0, 0.0], [0.9, 0.0], [0.0, 0.9], [0.9, 0.9]], dtype=torch.float64)
     >>> made = packing(x, torch.full((4,), 0.5), torch.ones(4), box=torch.tensor([1.8, 1.8]))
     >>> made.n_contacts  # each grain touches both copies of two others
@@ -148,7 +149,7 @@ def near_pairs(positions: Tensor, radii: Tensor, box: Tensor | None, skin: float
             copies, of, moved = (np.concatenate(kind) for kind in zip(*parts, strict=True))
             if len(copies) > MOST_IMAGES:
                 raise checks.fail("radii", "be smaller than the box by more", f"{len(copies)} copies within reach")
-    tree = spatial.cKDTree(copies)
+    tree = scipy.spatial.cKDTree(copies)
     pairs = tree.query_pairs(reach, output_type="ndarray") if len(copies) > 1 else np.zeros((0, 2), np.int64)
     pairs = pairs[pairs[:, 0] < n]  # the lower of the two is in the cell, whose centers come first
     gap = np.linalg.norm(copies[pairs[:, 1]] - copies[pairs[:, 0]], axis=1) - r[of[pairs[:, 0]]] - r[of[pairs[:, 1]]]

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter
-from scipy.optimize import least_squares
+import scipy
 from torch import Tensor
 
 from torchchain import checks
@@ -130,7 +129,7 @@ def fit_disorder(
     for _ in range(2):  # the weights follow the systematic error at the estimate
         _, systematic = model(parameters)
         weight = 1 / np.sqrt(variance + systematic**2 + 1e-10)
-        solution = least_squares(
+        solution = scipy.optimize.least_squares(
             lambda p, weight=weight: (model(p)[0] - mean) * weight,
             parameters, bounds=bounds, diff_step=_STEP, xtol=3e-4, ftol=1e-5, max_nfev=12, x_scale=np.array([1.0, 0.1])[: len(first)],
         )  # fmt: skip
@@ -157,12 +156,12 @@ def _pooled(
     make its error look smaller than it is.
     """
     if curve:
-        return uniform_filter(variance, 5, mode="nearest")
+        return scipy.ndimage.uniform_filter(variance, 5, mode="nearest")
     bands = np.array([band_of(tone, n_particles, shape[2]) - 1 for tone in tones])
     cube = variance.reshape(shape)
     rows = np.arange(len(tones))
     own = cube[rows, :, bands]
     mean = (cube.sum(-1) - own) / max(shape[2] - 1, 1)
-    pooled = np.repeat(uniform_filter(mean, 5, mode="nearest")[..., None], shape[2], axis=-1)
-    pooled[rows, :, bands] = uniform_filter(own, 5, mode="nearest")
+    pooled = np.repeat(scipy.ndimage.uniform_filter(mean, 5, mode="nearest")[..., None], shape[2], axis=-1)
+    pooled[rows, :, bands] = scipy.ndimage.uniform_filter(own, 5, mode="nearest")
     return pooled.ravel()

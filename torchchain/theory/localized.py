@@ -22,8 +22,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from torchchain.theory.ladder import Waves
@@ -156,7 +156,7 @@ class _Line:
         band = min(2 / math.sqrt(law.mean), edge / 1.2)
         w = np.unique(np.concatenate([np.linspace(edge * 1e-4, edge, 300), np.linspace(0.8 * band, 1.2 * band, 300)]))
         mass, _ = coherent_mass(self._above(torch.from_numpy(w)), law)
-        self._mass = CubicSpline(w, mass.numpy())
+        self._mass = scipy.interpolate.CubicSpline(w, mass.numpy())
 
     @staticmethod
     def _above(w: Tensor) -> Tensor:
