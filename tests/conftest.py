@@ -12,7 +12,7 @@ import tyro
 
 import torchchain as tc
 from torchchain import cli
-from torchchain.cli import outputs
+from torchchain.cli import entry, outputs
 
 RENDERED = outputs.figure
 
@@ -32,6 +32,23 @@ def one_look_at_sources():
     with pytest.MonkeyPatch.context() as patch:
         source = tyro._docstrings._ClassTokenization
         patch.setattr(source, "make", staticmethod(cache(source.make)))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_parser():
+    """The flags do not change, but tyro makes their parser anew in every call: most of the time of a command that is refused."""
+    make, known = tyro._parsers.ParserSpecification.from_callable_or_type, []
+
+    def kept(f, **rest):
+        if rest["description"] != entry.DESCRIPTION:  # a part of it
+            return make(f, **rest)
+        if not known:
+            known.append(make(f, **rest))
+        return known[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tyro._parsers.ParserSpecification, "from_callable_or_type", staticmethod(kept))
         yield
 
 
