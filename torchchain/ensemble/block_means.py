@@ -26,6 +26,8 @@ QUIET = 2.0**-40
 """Noise below this is that of rounding, and left out."""
 ERROR_BITS = 12
 """Significant bits of a standard error, itself known to a few per cent."""
+TOGETHER = 4
+"""Sources that are rounded together and stay in cache."""
 
 
 def rounded(blocks: Tensor, mean: Tensor, stderr: Tensor, counts: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -35,7 +37,13 @@ def rounded(blocks: Tensor, mean: Tensor, stderr: Tensor, counts: Sequence[int])
     mantissa, _ = torch.frexp(stderr)
     kept = (mantissa * 2.0**ERROR_BITS).round() / 2.0**ERROR_BITS
     stderr = torch.where(stderr.isfinite() & (stderr > 0), stderr / mantissa * kept, stderr)
-    return from_steps(steps(blocks, mean, stderr, counts), mean, stderr, counts), stderr
+    found = torch.empty_like(blocks)
+    for first in range(0, len(mean), TOGETHER):
+        some = slice(first, first + TOGETHER)
+        order, unit = _order(stderr[some], len(counts))
+        whole = _steps(_sorted(blocks[:, some] - mean[some], order), unit, counts)
+        found[:, some] = _unsorted(_deviations(whole, unit, counts), order).add_(mean[some])
+    return found, stderr
 
 
 def encoded(blocks: Tensor, mean: Tensor, stderr: Tensor, counts: Sequence[int]) -> np.ndarray | None:
@@ -45,8 +53,9 @@ def encoded(blocks: Tensor, mean: Tensor, stderr: Tensor, counts: Sequence[int])
     """
     if blocks.dtype != torch.float64 or mean.dtype != torch.float64 or blocks.numel() < LARGE:
         return None
-    whole = steps(blocks, mean, stderr, counts)
-    if not torch.equal(from_steps(whole, mean, stderr, counts), blocks):
+    order, units = _order(stderr, len(counts))
+    whole = _unsorted(_steps(_sorted(blocks - mean, order), units, counts), order)
+    if not torch.equal(_from_steps(whole, mean, stderr, counts), blocks):
         return None
     numbers, unit = whole.numpy(), _units(stderr, len(counts))
     missed = numbers.copy()
@@ -62,7 +71,7 @@ def decoded(missed: np.ndarray, mean: Tensor, stderr: Tensor, counts: Sequence[i
     numbers, unit = missed.astype(np.float64), _units(stderr, len(counts))
     for t in range(1, numbers.shape[2]):
         numbers[:, :, t] += _foretold(numbers, unit, t)
-    return from_steps(torch.from_numpy(numbers), mean, stderr, counts)
+    return _from_steps(torch.from_numpy(numbers), mean, stderr, counts)
 
 
 def _foretold(numbers: np.ndarray, unit: np.ndarray, t: int) -> np.ndarray:
@@ -73,11 +82,9 @@ def _foretold(numbers: np.ndarray, unit: np.ndarray, t: int) -> np.ndarray:
     return np.rint(np.divide(last, unit[:, t], out=np.zeros_like(last), where=unit[:, t] > 0))
 
 
-def steps(blocks: Tensor, mean: Tensor, stderr: Tensor, counts: Sequence[int]) -> Tensor:
-    """Block means in whole steps, (block, source, time, receiver): the inverse of :func:`from_steps`."""
-    order, unit = _order(stderr, len(counts))
+def _steps(apart: Tensor, unit: Tensor, counts: Sequence[int]) -> Tensor:
+    """Deviations of the blocks from the mean in whole steps: the inverse of :func:`_deviations`."""
     inverse = torch.where(unit > 0, 1 / unit, 0)
-    apart = _sorted(blocks - mean, order)
     found = torch.empty_like(apart)
     early, carried = apart[:, :-1], torch.zeros_like(apart[0, :-1])
     for r in range(len(apart) - 1):
@@ -86,30 +93,34 @@ def steps(blocks: Tensor, mean: Tensor, stderr: Tensor, counts: Sequence[int]) -
         carried -= found[r, :-1] * unit[r]
     found[-1, :-1] = (early.sum(0) * (inverse[-1] / REST)).round()
     found[:, -1] = ((_others(apart, counts) + apart[:, -1]) * inverse).round()
-    return _unsorted(found, order)
+    return found
 
 
-def from_steps(whole: Tensor, mean: Tensor, stderr: Tensor, counts: Sequence[int]) -> Tensor:
-    """Block means (block, source, time, receiver) from whole steps of the same axes.
+def _deviations(whole: Tensor, unit: Tensor, counts: Sequence[int]) -> Tensor:
+    """Deviations (receiver in order, block, source, time) from whole steps of the same axes, in their place.
 
     In the place of the noisiest receiver is the sum over receivers, in that of the last block the weighted sum over blocks.
     """
+    rest = whole[-1, :-1] * (unit[-1] * REST)
+    whole *= unit[:, None]
+    for r in range(len(whole) - 1):
+        rest -= whole[r, :-1]
+    whole[-1, :-1] = rest
+    whole[:, -1] -= _others(whole, counts)
+    return whole
+
+
+def _from_steps(whole: Tensor, mean: Tensor, stderr: Tensor, counts: Sequence[int]) -> Tensor:
+    """Block means from whole steps, both (block, source, time, receiver)."""
     order, unit = _order(stderr, len(counts))
-    apart = _sorted(whole, order)
-    rest = apart[-1, :-1] * (unit[-1] * REST)
-    apart *= unit[:, None]
-    for r in range(len(apart) - 1):
-        rest -= apart[r, :-1]
-    apart[-1, :-1] = rest
-    apart[:, -1] -= _others(apart, counts)
-    return _unsorted(apart, order).add_(mean)
+    return _unsorted(_deviations(_sorted(whole, order), unit, counts), order).add_(mean)
 
 
 def _others(apart: Tensor, counts: Sequence[int]) -> Tensor:
     """Sum over all blocks but the last, in weights of the last, of (receiver, block, source, time)."""
     total = torch.zeros_like(apart[:, 0])
     for block, count in enumerate(counts[:-1]):  # one after the other, so that every machine rounds the same
-        total += apart[:, block] * (count / counts[-1])
+        total += apart[:, block] if count == counts[-1] else apart[:, block] * (count / counts[-1])
     return total
 
 
