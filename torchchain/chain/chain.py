@@ -160,10 +160,13 @@ class Chain(checks.Fields):
         """A quantity of the contacts on the left of particle 1, 2, ..., N and on the right of N, (*batch, N + 1)."""
         return torch.cat([field, field[..., :1]], dim=-1) if self.is_free else field
 
-    def rigid_displacement(self, displacement: Tensor) -> Tensor:
-        """How far the chain has moved as a whole, the mean by mass, (*batch, *any, 1); 0 between walls."""
+    def without_rigid_motion(self, displacement: Tensor) -> Tensor:
+        """The displacement counted from where the chain has moved as a whole, the mean by mass; between walls as it is."""
+        mass = self.rigid_mass
+        if not checks.is_transformed(mass) and bool(mass.isinf().all()):
+            return displacement
         moment = (self.align(self.masses, displacement) * displacement).sum(-1, keepdim=True)
-        return moment / self.align(self.rigid_mass[..., None], displacement)
+        return displacement - moment / self.align(mass[..., None], displacement)
 
     def tension(self, elongation: Tensor) -> Tensor:
         """Pull of every contact relative to the precompressed state, (*batch, *any, contact)."""

@@ -50,7 +50,7 @@ def kicked(chain: Chain, trajectory: Trajectory) -> Trajectory:
     softness = 1 / chain.align(chain.contact_stiffness, pull)
     shared = (pull * softness).sum(-1, keepdim=True) / softness.expand_as(pull).sum(-1, keepdim=True)
     place = ((pull - shared) * softness).cumsum(-1)[..., : chain.n_particles]
-    return Trajectory(trajectory.times, place - chain.rigid_displacement(place), trajectory.displacement)
+    return Trajectory(trajectory.times, chain.without_rigid_motion(place), trajectory.displacement)
 
 
 def kicked_band_energy(

@@ -40,9 +40,8 @@ def kinetic_energy(chain: Chain, trajectory: Trajectory) -> Tensor:
     """
     checked(chain, trajectory)
     velocity = trajectory.velocity
-    return checks.finite(
-        "energy of trajectory", chain.align(chain.masses, velocity) * velocity.square() / 2, "particle"
-    )
+    energy = chain.align(chain.masses / 2, velocity) * velocity.square()
+    return checks.finite("energy of trajectory", energy, "particle")
 
 
 def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "site") -> Tensor:
@@ -67,7 +66,7 @@ def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "si
     displacement = trajectory.displacement
     if definition == "site":
         require_linear(chain, "definition 'bond'")
-        energy = chain.force(displacement) * (displacement - chain.rigid_displacement(displacement)) / -2
+        energy = chain.force(displacement) * chain.without_rigid_motion(displacement) / -2
         return checks.finite("energy of trajectory", energy, "particle")
     contact = checks.finite("energy of trajectory", chain.contact_energy(displacement), "contact")
     ends = chain.of_both_ends(torch.ones_like(displacement[..., 0, :]))[..., None, :]  # a wall's contact has one
@@ -158,7 +157,7 @@ def energy_matrices(chain: Chain, trajectory: Trajectory) -> EnergyMatrices:
     checked(chain, trajectory)
     require_linear(chain, "total_energy or particle_energy with definition 'bond'")
     displacement, velocity = trajectory.displacement, trajectory.velocity
-    displacement = displacement - chain.rigid_displacement(displacement)
+    displacement = chain.without_rigid_motion(displacement)
     masses = chain.align(chain.masses, velocity)
     kinetic = torch.einsum("...p,...q->...pq", masses * velocity, velocity) / 2
     potential = torch.einsum("...p,...q->...pq", chain.force(displacement), displacement) / -2

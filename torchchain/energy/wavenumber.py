@@ -49,7 +49,7 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
             wave = _transform(displacement)
             bound = strain * _product(wave, wave)
         else:
-            displacement = displacement - chain.rigid_displacement(displacement)
+            displacement = chain.without_rigid_motion(displacement)
             bound = -_product(_transform(chain.force(displacement)), _transform(displacement))
         energy = (moving + bound) / 2
     else:

@@ -85,7 +85,7 @@ def species_band_energy(
     masses, n, found = chain.align(chain.masses, velocity), chain.n_particles, []
     parts = _parts(chain, velocity, labels, n_species)
     if definition == "site":
-        displacement = displacement - chain.rigid_displacement(displacement)
+        displacement = chain.without_rigid_motion(displacement)
         speed, wave = _transform(velocity), _transform(displacement)
         momentum, force = masses * velocity, -chain.force(displacement)
     else:
