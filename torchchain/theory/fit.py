@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -103,13 +104,11 @@ def fit_disorder(
     band = band_of(found[0], n_particles, n_bands) - 1
     data = measured.detach().cpu().double().numpy().reshape(len(measured), -1)
     mean, variance = data.mean(0), _pooled(data.var(0, ddof=1) / len(data), curve, shape, found, n_particles)
-    count = 0
 
-    def model(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        nonlocal count
-        count += 1
-        strength = float(np.clip(math.exp(parameters[0]), WEAKEST, STRONGEST))
-        damping = float(parameters[1]) if fit_damping else 0.0
+    @cache
+    def at(*parameters: float) -> tuple[np.ndarray, np.ndarray]:
+        strength = min(max(math.exp(parameters[0]), WEAKEST), STRONGEST)
+        damping = parameters[1] if fit_damping else 0.0
         result = theory_transfer(
             replace(disorder, strength=strength), n_particles, n_bands, times, found, damping=max(damping, 0.0)
         )
@@ -119,6 +118,9 @@ def fit_disorder(
         return value.numpy().ravel(), error.expand_as(result.mean)[..., 0].numpy().ravel() if curve else (
             error.expand_as(result.mean).numpy().ravel()
         )
+
+    def model(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return at(*parameters.tolist())
 
     first = np.array([math.log(start)] + [0.01] * fit_damping)
     bounds = (
@@ -144,7 +146,7 @@ def fit_disorder(
     strength = math.exp(parameters[0])
     misfit = math.sqrt(float((solution.fun**2).mean()))
     damped = (float(parameters[1]), float(error[1])) if fit_damping else (0.0, 0.0)
-    return DisorderFit(strength, strength * float(error[0]), *damped, misfit, count)
+    return DisorderFit(strength, strength * float(error[0]), *damped, misfit, at.cache_info().misses)
 
 
 def _pooled(
