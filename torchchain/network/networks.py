@@ -34,8 +34,7 @@ class Network:
     Displacements, velocities and forces have the axes (*batch, *any, particle, component): as many components as
     dimensions for motion "vector", one for "scalar".
 
-    >>> import scipy
-import torch
+    >>> import torch
     >>> triangle = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 0.75**0.5]], dtype=torch.float64)
     >>> network = Network(torch.ones(3), triangle, [[0, 1], [1, 2], [2, 0]])
     >>> network.n_particles, network.n_bonds, network.dimension

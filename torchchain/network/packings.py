@@ -66,8 +66,7 @@ def packing(
 ) -> Packing:
     """The network of the contacts of overlapping disks or spheres.
 
-    >>> import scipy
-import torch
+    >>> import torch
     >>> x = torch.tensor([[0.0, 0.0], [0.9, 0.0], [0.0, 0.9], [0.9, 0.9]], dtype=torch.float64)
     >>> made = packing(x, torch.full((4,), 0.5), torch.ones(4), box=torch.tensor([1.8, 1.8]))
     >>> made.n_contacts  # each grain touches both copies of two others
