@@ -107,7 +107,7 @@ def side_by_side(work: Callable[[int, int], None], count: int) -> None:
     :func:`map_in_order` must, makes later small operations slow beside a busy process.
     """
     workers = min(torch.get_num_threads(), count)
-    if workers == 1:
+    if workers <= 1:
         work(0, count)
         return
     with ThreadPoolExecutor(workers) as pool:

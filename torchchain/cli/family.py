@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from torchchain import checks
-from torchchain.cli import outputs
+from torchchain.cli import outputs, plugins
 from torchchain.cli.flags import Family
 from torchchain.master import MasterEquation, MasterFamily
 from torchchain.results import model_file
@@ -17,6 +17,7 @@ from torchchain.results import model_file
 def run_family(flags: Family, arguments: list[str]) -> None:
     """Join models of several strengths and leave the family and its record."""
     began = time.time()
+    plugins.load(())
     if not flags.models:
         raise checks.fail("models", "be at least one file", "none")
     paths = [model_file(path) for path in flags.models]

@@ -132,7 +132,7 @@ def _config(flags: Import, files: list[RunFiles]) -> str:
     return tomli_w.dumps(given | {"runs": [str(run.path) for run in files]})
 
 
-def run_convert(flags: Convert) -> None:
+def run_convert(flags: Convert, arguments: list[str]) -> None:
     """Write the frames of a run into one netCDF file."""
     for name in ("run", "out"):
         if not getattr(flags, name):

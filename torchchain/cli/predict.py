@@ -175,9 +175,7 @@ def _in_space(field: str, table: Any, master: MasterEquation) -> tuple[StartEner
         start, labels = start_energy(Chain(torch.ones_like(none)), state), ["state"]
     if start.rigid.ndim == 0:
         start = StartEnergy(*(getattr(start, name)[None] for name in ("potential", "kinetic", "virial", "rigid")))
-    size = start.total[:, None]
-    unit = StartEnergy(start.potential / size, start.kinetic / size, start.virial / size, start.rigid / start.total)
-    return unit, labels, request
+    return start.of_unit_energy(), labels, request
 
 
 def _dataset(

@@ -42,7 +42,7 @@ NEEDED_OF_TRANSFER: dict[str, type] = {"transfer.path": str, "transfer.sha256": 
 SAID_ELSEWHERE = ("torchchain_version",)  # attributes that the record's versions hold
 
 
-def rerun(flags: Rerun) -> int:
+def rerun(flags: Rerun, arguments: list[str]) -> int:
     """Make a run again and say what differs; returns 0 if nothing does, else 1.
 
     The scene comes from the folder's resolved config.toml and the method with its options from its record, so that a

@@ -64,6 +64,11 @@ class StartEnergy:
         """Energy in all, (*batch,)."""
         return (self.potential + self.kinetic).sum(-1) + self.rigid
 
+    def of_unit_energy(self) -> StartEnergy:
+        """The same starts with energy 1 each."""
+        size = self.total[..., None]
+        return StartEnergy(self.potential / size, self.kinetic / size, self.virial / size, self.rigid / self.total)
+
     def bands(self, n_bands: int) -> Tensor:
         """Energy in each band, (*batch, band); that at k = 0 is in none."""
         tones = self.potential + self.kinetic

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.ensemble.statistics import jackknife_error
 
 LARGEST_CONDITION = 1e3
 """Of the least-squares problem; noise in the energies grows by up to this factor in the transfer."""
@@ -78,9 +79,7 @@ def fit_transfer(starts: Tensor, energies: Tensor, realization: Tensor) -> Fitte
 def _jackknife(mean: Tensor, replicates: Tensor, counts: tuple[int, ...], condition: float) -> FittedTransfer:
     """The transfer with the error and the pseudo-values of those without one block each."""
     blocks = len(counts)
-    spread = (replicates - replicates.mean(0)).square().sum(0)
-    stderr = (spread * (blocks - 1) / blocks).sqrt()
-    return FittedTransfer(mean, stderr, blocks * mean - (blocks - 1) * replicates, counts, condition)
+    return FittedTransfer(mean, jackknife_error(replicates), blocks * mean - (blocks - 1) * replicates, counts, condition)
 
 
 def _check_left(starts: Tensor, kept: Tensor, realization: Tensor) -> None:

@@ -285,7 +285,6 @@ def _rows(chain: Chain, state: State, composition: Composition, step: Tensor | f
             tensor.detach().numpy() for tensor in (displacement, velocity, peak, lost, weight, stiffness, damping)
         ]
         advance_rows(
-            torch.get_num_threads(),
             *arrays,
             periodic,
             hertz,

@@ -8,13 +8,13 @@ wall's (at rest) or the neighbor's across the seam, so that contact c joins entr
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
 from torchchain.evolvers import kernels
 from torchchain.evolvers.compiling import kernel, summing_kernel
+from torchchain.threads import side_by_side
 
 
 @kernel
@@ -161,11 +161,10 @@ def _advance_rows(
         )  # fmt: skip
 
 
-def advance_rows(threads: int, *arguments: Any) -> None:
-    """Advance every row in place and fill its outputs.
+def advance_rows(*arguments: Any) -> None:
+    """Advance every row in place and fill its outputs, on as many threads as torch uses.
 
     Args:
-        threads: how many share the rows.
         arguments: displacement and velocity (row, particle), peak elongation (row, contact + 1) and energy lost
             (row,), all updated; weight 1/m (chain, particle), stiffness and damping (chain, contact + 1), a periodic
             chain's contact 0 being repeated at the end; the flags periodic, hertz and damped; the composition's
@@ -173,12 +172,5 @@ def advance_rows(threads: int, *arguments: Any) -> None:
             the outputs displacement and velocity (row, time, particle), energy lost and openings (row, time).
     """
     kernels.announce(_advance_rows)
-    rows = len(arguments[0])
-    threads = min(threads, rows)
-    if threads <= 1:
-        _advance_rows(0, rows, *arguments)
-        return
-    edges = np.linspace(0, rows, threads + 1).astype(int).tolist()
     # Python's own threads, as the loop holds no lock: numba's may not be called from several of them at once.
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda begin, end: _advance_rows(begin, end, *arguments), edges[:-1], edges[1:]))
+    side_by_side(lambda begin, end: _advance_rows(begin, end, *arguments), len(arguments[0]))

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchchain import checks
+from torchchain.frames.passes import Passed, frames_at, scanned, where
 from torchchain.frames.record import AXES, Box
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import CutShort, Text, gone, parse
+from torchchain.frames.text import CutShort, Text, as_number, parse
 
 SAME = {"id": "id", "type": "type", "mass": "mass", "radius": "radius", "vx": "vx", "vy": "vy", "vz": "vz"}
 INTEGERS = {"id", "type", "ix", "iy", "iz"}
@@ -34,11 +36,6 @@ class Header:
 def lists_contacts(head: bytes) -> bool:
     """Whether a file begins like a dump of pairs: of entries, or of what ``dump_modify label`` calls them."""
     return head.lstrip().startswith(b"ITEM: ") and re.search(rb"ITEM: NUMBER OF (?!ATOMS)", head) is not None
-
-
-def where(name: str, number: int) -> str:
-    """File and frame, as errors begin."""
-    return f"{name}, frame {number}"
 
 
 def read_header(text: Text, number: int, label: str) -> Header | None:
@@ -70,15 +67,15 @@ def read_header(text: Text, number: int, label: str) -> Header | None:
             raise checks.fail(here, "begin with lines 'ITEM: ...' (a LAMMPS text dump)", checks.shown(line, 40))
         item = line[6:]
         if item.startswith("TIMESTEP"):
-            step = int(_number(here, "TIMESTEP", _next(text), whole=True))
+            step = int(as_number(f"{here}: TIMESTEP", _next(text), whole=True))
         elif item == "TIME":
-            time = float(_number(here, "TIME", _next(text)))
+            time = float(as_number(f"{here}: TIME", _next(text)))
         elif item == "UNITS":
             units = _next(text)
         elif item == "LABEL":
             _next(text)
         elif item.startswith("NUMBER OF "):
-            count = int(_number(here, item, _next(text), whole=True))
+            count = int(as_number(f"{here}: {item}", _next(text), whole=True))
             if count < 0:
                 raise checks.fail(f"{here}: {item}", "not be negative", count)
         elif item.startswith("BOX BOUNDS"):
@@ -112,19 +109,6 @@ def _next(text: Text) -> str:
     return line
 
 
-def _number(here: str, field: str, word: str, whole: bool = False) -> float:
-    try:
-        if "_" in word:
-            raise ValueError
-        value = int(word) if whole else float(word)
-        good = abs(value) < 2**63 and np.isfinite(float(value))
-    except ValueError:
-        good = False
-    if not good:
-        raise checks.fail(f"{here}: {field}", f"be a {'whole' if whole else 'finite'} number", checks.shown(word, 40))
-    return value
-
-
 def _box(here: str, words: list[str], lines: list[str]) -> Box:
     sides = [line.split() for line in lines]
     if any(word in ("xy", "abc") for word in words) or any(len(side) > 2 for side in sides):
@@ -139,7 +123,7 @@ def _box(here: str, words: list[str], lines: list[str]) -> Box:
             "be two numbers a line",
             checks.shown(next(s for s in lines if len(s.split()) != 2), 40),
         )
-    bounds = [[_number(here, "BOX BOUNDS", word) for word in side] for side in sides]
+    bounds = [[as_number(f"{here}: BOX BOUNDS", word) for word in side] for side in sides]
     for axis, (low, high) in zip(AXES, bounds, strict=True):
         if not low <= high:
             raise checks.fail(f"{here}: BOX BOUNDS", f"have {axis} bounds in order", f"{low:g} {high:g}")
@@ -150,30 +134,29 @@ def _box(here: str, words: list[str], lines: list[str]) -> Box:
 
 
 def scan_dump(path: Path, label: str) -> Scan:
-    """All frames of a dump, from one pass that looks at their headers only."""
-    entries: list[Entry] = []
-    units, columns = None, None
-    with Text(path) as text:
-        while True:
-            number, offset = len(entries) + 1, text.position
-            try:
-                header = read_header(text, number, label)
-                if header is None:
-                    return Scan(entries, None, units)
-                units = units or header.units
-                if columns is not None and header.columns != columns:
-                    raise checks.fail(
-                        f"{where(path.name, number)}: columns",
-                        f"stay {checks.shown(' '.join(columns), 50)}",
-                        checks.shown(" ".join(header.columns), 50),
-                    )
-                columns = header.columns
-                held = text.skip(header.count, b"ITEM:")
-            except CutShort as cut:
-                return Scan(entries, f"{where(path.name, number)}: the file ends after {cut.rows} of its rows", units)
-            if held < header.count:
-                raise checks.fail(f"{where(path.name, number)}: rows", f"be {header.count} as announced", held)
-            entries.append(Entry(number, offset, header.count, header.step, header.time))
+    """All headers of a file, and whether each has as many rows as it announces."""
+    units: str | None = None
+    columns: tuple[str, ...] | None = None
+
+    def passed(text: Text, number: int) -> Passed | None:
+        nonlocal units, columns
+        header = read_header(text, number, label)
+        if header is None:
+            return None
+        units = units or header.units
+        if columns is not None and header.columns != columns:
+            raise checks.fail(
+                f"{where(path.name, number)}: columns",
+                f"stay {checks.shown(' '.join(columns), 50)}",
+                checks.shown(" ".join(header.columns), 50),
+            )
+        columns = header.columns
+        held = text.skip(header.count, b"ITEM:")
+        if held < header.count:
+            raise checks.fail(f"{where(path.name, number)}: rows", f"be {header.count} as announced", held)
+        return header.count, header.step, header.time
+
+    return replace(scanned(path, passed), units=units)
 
 
 def _scan(path: Path, options: dict[str, Any]) -> Scan:
@@ -181,24 +164,17 @@ def _scan(path: Path, options: dict[str, Any]) -> Scan:
 
 
 def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iterator[Raw]:
-    with Text(path) as text:
-        for entry in entries:
-            text.seek(entry.offset)
-            here = where(path.name, entry.number)
-            header = read_header(text, entry.number, "ATOMS")
-            if header is None:
-                raise gone(here)
-            columns = header.columns
-            wanted = {
-                name
-                for name in columns
-                if name in SAME
-                or name in INTEGERS
-                or name == "diameter"
-                or name.removesuffix("u").removesuffix("s") in AXES
-            }
-            rows = parse(here, text.blocks(header.count), columns, INTEGERS, wanted)
-            yield _convert(here, rows, header.box)
+    for text, here, _, header in frames_at(path, entries, partial(read_header, label="ATOMS")):
+        wanted = {
+            name
+            for name in header.columns
+            if name in SAME
+            or name in INTEGERS
+            or name == "diameter"
+            or name.removesuffix("u").removesuffix("s") in AXES
+        }
+        rows = parse(here, text.blocks(header.count), header.columns, INTEGERS, wanted)
+        yield _convert(here, rows, header.box)
 
 
 def _convert(here: str, rows: dict[str, np.ndarray], box: Box | None) -> Raw:

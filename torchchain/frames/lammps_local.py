@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from torchchain import checks
-from torchchain.frames.lammps import lists_contacts, read_header, scan_dump, where
+from torchchain.frames.lammps import lists_contacts, read_header, scan_dump
+from torchchain.frames.passes import frames_at
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import Text, gone, parse
+from torchchain.frames.text import parse
 
 FIELDS = ("id1", "id2", "overlap", "distance", "normal_force")
 PAIRS = (("id1", "id2"), ("patom1", "patom2"), ("natom1", "natom2"), ("batom1", "batom2"))
@@ -25,18 +27,9 @@ def scan(path: Path, options: dict[str, Any]) -> Scan:
 
 def read_columns(path: Path, entries: Iterable[Entry]) -> Iterator[tuple[str, Sequence[str], dict[str, np.ndarray]]]:
     """File and frame, the names of all columns in order, and their numbers."""
-    with Text(path) as text:
-        for entry in entries:
-            text.seek(entry.offset)
-            here = where(path.name, entry.number)
-            header = read_header(text, entry.number, "ENTRIES")
-            if header is None:
-                raise gone(here)
-            yield (
-                here,
-                header.columns,
-                parse(here, text.blocks(header.count), header.columns, set(), set(header.columns)),
-            )
+    for text, here, _, header in frames_at(path, entries, partial(read_header, label="ENTRIES")):
+        columns = header.columns
+        yield here, columns, parse(here, text.blocks(header.count), columns, set(), set(columns))
 
 
 def whole(here: str, name: str, values: np.ndarray) -> np.ndarray:

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from torchchain import checks
-from torchchain.frames.lammps import where
+from torchchain.frames.passes import Passed, frames_at, scanned, where
 from torchchain.frames.record import Box
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import CutShort, Text, gone, parse
+from torchchain.frames.text import CutShort, Text, parse
 
 # A header of N, time and the corners of the domain: 2 + 4 numbers in two dimensions, 2 + 6 in three. A row is position,
 # velocity, radius, angle, angular velocity and one number of the user's (the species unless changed).
@@ -69,37 +69,25 @@ def _header(text: Text, number: int) -> tuple[int, float, list[float]] | None:
 
 
 def _scan(path: Path, options: dict[str, Any]) -> Scan:
-    entries: list[Entry] = []
-    with Text(path) as text:
-        while True:
-            number, offset = len(entries) + 1, text.position
-            rows = 0
-            try:
-                header = _header(text, number)
-                if header is None:
-                    return Scan(entries)
-                for block in text.blocks(header[0]):
-                    rows += block.count(b"\n")
-            except CutShort as cut:
-                return Scan(entries, f"{where(path.name, number)}: the file ends after {rows or cut.rows} of its rows")
-            entries.append(Entry(number, offset, header[0], None, header[1]))
+    def passed(text: Text, number: int) -> Passed | None:
+        header = _header(text, number)
+        if header is None:
+            return None
+        for _ in text.blocks(header[0]):
+            pass
+        return header[0], None, header[1]
+
+    return scanned(path, passed)
 
 
 def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iterator[Raw]:
     columns: tuple[str, ...] | None = None
-    with Text(path) as text:
-        for entry in entries:
-            text.seek(entry.offset)
-            here = where(path.name, entry.number)
-            header = _header(text, entry.number)
-            if header is None:
-                raise gone(here)
-            count, _, corners = header
-            if columns is None and count:
-                columns = _columns(here, text, len(corners) // 2)
-            rows = parse(here, text.blocks(count), columns or SOLID, set(), WANTED)
-            rows["id"] = np.arange(count)
-            yield Raw(rows, _box(corners))
+    for text, here, _, (count, _, corners) in frames_at(path, entries, _header):
+        if columns is None and count:
+            columns = _columns(here, text, len(corners) // 2)
+        rows = parse(here, text.blocks(count), columns or SOLID, set(), WANTED)
+        rows["id"] = np.arange(count)
+        yield Raw(rows, _box(corners))
 
 
 def _box(corners: list[float]) -> Box:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from torchchain import checks
-from torchchain.frames.lammps import where
+from torchchain.frames.passes import Passed, frames_at, scanned, where
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import CutShort, Text, parse
+from torchchain.frames.text import CutShort, Text, as_number, parse
 
 # Three lines that begin with '#' (time and a marker; domain; radii), then one row a contact and side.
 COLUMNS = (
@@ -35,47 +35,25 @@ def _header(text: Text, number: int) -> float | None:
                 f"{where(text.name, number)}: header", "be three lines that begin with '#'", checks.shown(line, 40)
             )
         lines.append(line[1:].split())
-    try:
-        time = float(lines[0][0])
-        good = bool(np.isfinite(time)) and "_" not in lines[0][0]
-    except (IndexError, ValueError):
-        good = False
-    if not good:
-        raise checks.fail(
-            f"{where(text.name, number)}: time", "be a finite number", checks.shown(" ".join(lines[0]), 40)
-        )
-    return time
+    return as_number(f"{where(text.name, number)}: time", lines[0][0] if lines[0] else "")
 
 
 def _scan(path: Path, options: dict[str, Any]) -> Scan:
-    entries: list[Entry] = []
-    with Text(path) as text:
-        while True:
-            number, offset = len(entries) + 1, text.position
-            try:
-                time = _header(text, number)
-                if time is None:
-                    return Scan(entries)
-                count = text.count_until(b"#")
-            except CutShort:
-                return Scan(entries, f"{where(path.name, number)}: the file ends within a line")
-            entries.append(Entry(number, offset, count, None, time))
+    def passed(text: Text, number: int) -> Passed | None:
+        time = _header(text, number)
+        return None if time is None else (text.count_until(b"#"), None, time)
+
+    return scanned(path, passed)
 
 
 def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iterator[Raw]:
-    with Text(path) as text:
-        for entry in entries:
-            text.seek(entry.offset)
-            here = where(path.name, entry.number)
-            _header(text, entry.number)
-            rows = parse(
-                here, text.blocks(entry.count), COLUMNS, {"id1", "id2"}, {"id1", "id2", "overlap", "normal_force"}
-            )
-            for name in ("id1", "id2"):
-                bad = np.abs(rows[name]) >= _LARGE
-                if bad.any():
-                    raise checks.fail(f"{here}: {name}", f"be below {_LARGE}", int(rows[name][bad][0]))
-            yield Raw(_once(rows))
+    for text, here, entry, _ in frames_at(path, entries, _header):
+        rows = parse(here, text.blocks(entry.count), COLUMNS, {"id1", "id2"}, {"id1", "id2", "overlap", "normal_force"})
+        for name in ("id1", "id2"):
+            bad = np.abs(rows[name]) >= _LARGE
+            if bad.any():
+                raise checks.fail(f"{here}: {name}", f"be below {_LARGE}", int(rows[name][bad][0]))
+        yield Raw(_once(rows))
 
 
 def _once(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchchain import checks
-from torchchain.frames.lammps import where
+from torchchain.frames.passes import where
 from torchchain.frames.record import AXES, Box, Frame
 from torchchain.frames.registry import Entry, Format, Raw, Scan
 from torchchain.frames.text import GZIP_RATIO

@@ -8,6 +8,7 @@ import io
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -31,11 +32,6 @@ class CutShort(Exception):
     def __init__(self, rows: int = 0) -> None:
         super().__init__()
         self.rows = rows
-
-
-def gone(here: str) -> checks.FieldError:
-    """The error for a frame that the first pass over its file found, and that is there no more."""
-    return checks.fail(here, "stay as it was when the file was opened", "its end")
 
 
 def readable(field: str, path: Path) -> Path:
@@ -186,7 +182,10 @@ class Text:
                 done += found
                 self._start += end
                 self.position += end
-            elif not self._fill():
+            else:
+                with suppress(CutShort):  # of damaged bytes: so many rows are whole
+                    if self._fill():
+                        continue
                 raise CutShort(done)
 
     def count_until(self, mark: bytes) -> int:
@@ -219,6 +218,20 @@ class Text:
                 return done + block.count(b"\n", 0, at)
             done += block.count(b"\n")
         return done
+
+
+def as_number(field: str, word: str, whole: bool = False) -> float:
+    """A word of a file as a finite number."""
+    try:
+        if "_" in word:
+            raise ValueError
+        value = int(word) if whole else float(word)
+        good = abs(value) < 2**63 and np.isfinite(float(value))
+    except ValueError:
+        good = False
+    if not good:
+        raise checks.fail(field, f"be a {'whole' if whole else 'finite'} number", checks.shown(word, 40))
+    return value
 
 
 def parse(

@@ -7,16 +7,17 @@ import io
 import re
 import warnings
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchchain import checks
-from torchchain.frames.lammps import where
+from torchchain.frames.passes import Passed, frames_at, scanned, where
 from torchchain.frames.record import AXES, Box
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import CutShort, Text, gone
+from torchchain.frames.text import CutShort, Text
 
 NAMES = {
     "id": ("id", "ids", "particle_identifier"), "mass": ("mass", "masses"), "radius": ("radius", "radii"),
@@ -96,39 +97,22 @@ def _of(here: str, info: dict[str, Any], keys: tuple[str, ...]) -> float | None:
 
 
 def _scan(path: Path, options: dict[str, Any]) -> Scan:
-    ase, entries = _ase(), list[Entry]()
-    with Text(path) as text:
-        while True:
-            number, offset = len(entries) + 1, text.position
-            try:
-                found = _frame(text, number, ase, whole=False)
-            except CutShort as cut:
-                return Scan(entries, f"{where(path.name, number)}: the file ends after {cut.rows} of its rows")
-            if found is None:
-                return Scan(entries)
-            count, info = found
-            step = _of(where(path.name, number), info, STEPS)
-            entries.append(
-                Entry(
-                    number,
-                    offset,
-                    count,
-                    None if step is None else int(step),
-                    _of(where(path.name, number), info, TIMES),
-                )
-            )
+    ase = _ase()
+
+    def passed(text: Text, number: int) -> Passed | None:
+        found = _frame(text, number, ase, whole=False)
+        if found is None:
+            return None
+        count, info = found
+        step, time = (_of(where(path.name, number), info, keys) for keys in (STEPS, TIMES))
+        return count, None if step is None else int(step), time
+
+    return scanned(path, passed)
 
 
 def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iterator[Raw]:
-    ase = _ase()
-    with Text(path) as text:
-        for entry in entries:
-            text.seek(entry.offset)
-            found = _frame(text, entry.number, ase, whole=True)
-            here = where(path.name, entry.number)
-            if found is None:
-                raise gone(here)
-            yield _convert(here, found[1])
+    for _, here, _, (_, atoms) in frames_at(path, entries, partial(_frame, ase=_ase(), whole=True)):
+        yield _convert(here, atoms)
 
 
 def _convert(here: str, atoms: Any) -> Raw:

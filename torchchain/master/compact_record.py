@@ -137,12 +137,6 @@ def loss_tensors(sample: Sample, mean: Tensor | None = None) -> dict[str, Tensor
     return {"loss": torch.from_numpy(found), "contact_damping": torch.tensor(sample.scene.damping, dtype=torch.float64)}
 
 
-def drawn_rates(transfer: BandTransfer, window: tuple[float, float], repeats: Tensor) -> Tensor:
-    """Slopes of the linear procedure in the same ensembles, [replica, source, receiver]."""
-    slopes = torch.einsum("t,bstr->bsr", linear_weights(transfer.times, window), transfer.block_mean)
-    return torch.einsum("ab,bsr->asr", block_weights(transfer, repeats), slopes)
-
-
 def regression_of(sample: Sample, degrees: tuple[int, int, int]) -> Regression:
     """The regression of a sample of chains of a scene; of damped ones, of the shares of what is left."""
     assert sample.scene is not None, "check_scene has seen it"

@@ -36,9 +36,8 @@ def starts(master: MasterEquation, scene: Scene) -> Tensor | StartEnergy:
     """A unit energy in the band of each tone, (tone, band); of a model of any start, that of the scene, of energy 1 each."""
     if master.starts is not None:
         wave = scene.excitation
-        found = excited(replace(wave, tones=scene.tones) if isinstance(wave, StandingWave) else wave, scene.n_particles)
-        size = found.total[..., None]
-        return StartEnergy(found.potential / size, found.kinetic / size, found.virial / size, found.rigid / found.total)
+        wave = replace(wave, tones=scene.tones) if isinstance(wave, StandingWave) else wave
+        return excited(wave, scene.n_particles).of_unit_energy()
     return torch.eye(master.n_bands, dtype=torch.float64)[[band - 1 for band in scene.source_bands]]
 
 

@@ -92,10 +92,6 @@ class TriadModel(nn.Module):
         """de/dt, (*batch, band), from energies per particle (*batch, band)."""
         return (self.coupling * self.flux(energy)) @ self.exchange
 
-    def entropy(self, energy: Tensor) -> Tensor:
-        """Sum over bands of d log(e / d), (*batch,), which never falls; greatest where every mode has the same energy."""
-        return (self.density * (energy / self.density).log()).sum(-1)
-
     def solve(
         self, initial: Any, times: Any, method: str = "dopri5", rtol: float = 1e-7, atol: float | None = None
     ) -> Tensor:
