@@ -37,7 +37,7 @@ from torchchain.progress import log
 
 FORMAT = "torchchain-checkpoint-1"
 EVERY = 5.0
-SHARE = 20  # saving takes at most one part in so many of the time
+SAVING = 20  # takes at most one part in so many of the time
 _NAME = re.compile(r"(\d{5})-(\d{5}|base)\.safetensors")
 
 
@@ -211,7 +211,7 @@ class Writer:
     def due(self) -> bool:
         """Whether it is time to save again."""
         every = self.checkpoint.every
-        return time.monotonic() - self.last >= (max(every, SHARE * self.cost) if every else 0.0)
+        return time.monotonic() - self.last >= (max(every, SAVING * self.cost) if every else 0.0)
 
     def save(self, moments: EnsembleMoments) -> None:
         """Save now; a failure is a warning, and what was saved before stays."""

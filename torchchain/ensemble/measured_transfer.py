@@ -64,7 +64,7 @@ def band_transfer(
             than 1500 unknowns it is the mean over the later half of the times, whose error counts what has not settled.
         device, memory_budget, progress, stages, options: see :func:`stream`.
         checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
-        ranks: processes that share the realizations, from :func:`torchchain.ranks.process_group`; each gets the result.
+        ranks: processes that share the realizations, from :func:`torchchain.ensemble.ranks.process_group`; each gets the result.
         starts: also measure the transfer from other tones of each band and from kicks, of undamped, linear rings with 16 samples
             and more: a model calibrated on it takes any start in space. It adds about two thirds to the cost.
 

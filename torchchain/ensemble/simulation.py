@@ -41,7 +41,7 @@ def simulate(
         method: a name of ``evolvers.METHODS``, or "auto" for the plan's choice.
         device, memory_budget, progress, stages, options: see :func:`stream`.
         checkpoint: a folder that keeps finished realizations; the same call goes on from what is in it.
-        ranks: processes that share the realizations, from :func:`torchchain.ranks.process_group`; each gets the result.
+        ranks: processes that share the realizations, from :func:`torchchain.ensemble.ranks.process_group`; each gets the result.
 
     Returns:
         Dataset with a variable and its ``_stderr`` for every observable, axes ([tone,] time, particle | wavenumber |

@@ -39,7 +39,7 @@ from torchchain.evolvers.symplectic import (
 )
 from torchchain.odes import INTEGRATORS, IntegrationError, Integrator, member_norm, step_grid
 
-ALLOWED_DRIFT = 0.1
+ALLOWED_CHANGE = 0.1
 
 
 class _Motion:
@@ -134,7 +134,7 @@ def _evolve(
             stacked[..., -1] * motion.amplitude[..., None] if motion.damped else None,
             openings,
         )
-        energy_guard.check(chain, trajectory, initial, ALLOWED_DRIFT, remedy)
+        energy_guard.check(chain, trajectory, initial, ALLOWED_CHANGE, remedy)
         return trajectory
 
     return advance

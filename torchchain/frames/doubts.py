@@ -15,7 +15,7 @@ from torchchain.chain.states import Trajectory
 from torchchain.frames.record import AXES, Frame, FramesWarning
 from torchchain.network import Network, total_energy
 
-DRIFT = 0.01  # share of the energy that an undamped run may gain or lose before a warning
+CHANGED = 0.01  # share of the energy that an undamped run may gain or lose before a warning
 NOISE = 1e-3  # share of the displacement that the digits of the positions may leave out
 
 
@@ -132,7 +132,7 @@ def check_energy(name: str, chain: Chain | Network, path: Trajectory) -> None:
     if float(change[run, k]) > 1:
         reasons = f"a kick after it, or another stiffness, or units, than the {kind}'s"
         raise checks.fail(field, "be that of the first frame", f"{words}: {reasons}")
-    if abs(float(change[run, k])) > DRIFT:
+    if abs(float(change[run, k])) > CHANGED:
         warn(
             field,
             f"{words}, for a {kind} without damping: damping or too long a time step there, or another stiffness than the {kind}'s",

@@ -322,11 +322,11 @@ def grain_force(x, radii, pairs, shifts, hertz, modulus, damping, velocity, forc
         for a in range(d):
             r = x[j, a] - x[i, a] + shifts[e, a]
             square += r * r
-        reach = radii[i] + radii[j]
-        if square >= reach * reach:
+        touching = radii[i] + radii[j]
+        if square >= touching * touching:
             continue
         length = np.sqrt(square)
-        overlap = reach - length
+        overlap = touching - length
         push = modulus * overlap
         if hertz:
             push *= np.sqrt(overlap) * (2.0 / 3.0)

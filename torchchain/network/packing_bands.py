@@ -16,7 +16,7 @@ from torchchain.network.networks import Network
 from torchchain.network.wavenumber import POLARIZATIONS, box_wavevectors, plane_wave_energy, plane_waves, shell_energy
 
 _OTHER = 6  # the random stream of starts in the last band
-REACH = 2.0  # of the longest wavevector by default, over the mean bond length
+LARGEST = 2.0  # of the longest wavevector by default, over the mean bond length
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def packing_bands(network: Network, n_shells: int = 4, largest: float | None = N
     if largest is None:
         if not network.n_bonds:
             raise checks.fail("bonds", "be at least one for a scale of wavenumbers (or give largest)", 0)
-        largest = REACH / float(network.lengths.mean())
+        largest = LARGEST / float(network.lengths.mean())
     largest = checks.number("largest wavenumber", largest, above=0)
     kinds = POLARIZATIONS if network.n_components > 1 else ("scalar",)
     bands = PackingBands(n_shells, largest, kinds)

@@ -122,7 +122,7 @@ def near_pairs(positions: Tensor, radii: Tensor, box: Tensor | None, skin: float
     """Pairs of grains, copies across the box included, with a gap below ``skin``: bonds (pair, 2), images (pair, dimension)."""
     x, r = positions.detach().double().cpu().numpy(), radii.detach().double().cpu().numpy()
     n, d = x.shape
-    reach = 2 * r.max() + skin
+    farthest = 2 * r.max() + skin
     shift = np.zeros((n, d), np.int64)  # of a center into the cell
     copies, of, moved = x, np.arange(n), np.zeros((n, d), np.int64)
     if box is not None:
@@ -137,11 +137,11 @@ def near_pairs(positions: Tensor, radii: Tensor, box: Tensor | None, skin: float
         width = 1 / np.linalg.norm(inverse, axis=0)
         copies = x
         for a in np.flatnonzero(periodic):
-            depth = int(np.ceil(reach / width[a]))
+            depth = int(np.ceil(farthest / width[a]))
             parts = [(copies, of, moved)]
             for turn in [*range(-depth, 0), *range(1, depth + 1)]:
                 place = fraction[of, a] + turn
-                near = (place > -reach / width[a]) & (place < 1 + reach / width[a])
+                near = (place > -farthest / width[a]) & (place < 1 + farthest / width[a])
                 add = np.zeros(d, np.int64)
                 add[a] = turn
                 parts.append((copies[near] + add @ cell, of[near], moved[near] + add))
@@ -149,7 +149,7 @@ def near_pairs(positions: Tensor, radii: Tensor, box: Tensor | None, skin: float
             if len(copies) > MOST_IMAGES:
                 raise checks.fail("radii", "be smaller than the box by more", f"{len(copies)} copies within reach")
     tree = scipy.spatial.cKDTree(copies)
-    pairs = tree.query_pairs(reach, output_type="ndarray") if len(copies) > 1 else np.zeros((0, 2), np.int64)
+    pairs = tree.query_pairs(farthest, output_type="ndarray") if len(copies) > 1 else np.zeros((0, 2), np.int64)
     pairs = pairs[pairs[:, 0] < n]  # the lower of the two is in the cell, whose centers come first
     gap = np.linalg.norm(copies[pairs[:, 1]] - copies[pairs[:, 0]], axis=1) - r[of[pairs[:, 0]]] - r[of[pairs[:, 1]]]
     pairs = pairs[gap < skin]

@@ -16,7 +16,7 @@ from torchchain.network.networks import Network
 from torchchain.network.packings import Packing, contact_law, near_pairs
 from torchchain.network.trajectories import NetworkTrajectory
 
-SHARE = 0.1  # of 1 / W: the default step
+DEFAULT = 0.1  # step, in units of 1 / W
 SKIN = 0.2  # of the largest radius: pairs are listed up to gaps of that
 
 
@@ -34,7 +34,7 @@ def start(network: Network, state: State, step: float | None = None, linear: boo
         top = network.squared_frequency_bound().sqrt().amax().item()
     rate = _damping_rate(network)
     if step is None:
-        step = SHARE / max(top, rate, 1e-300)
+        step = DEFAULT / max(top, rate, 1e-300)
     step = checks.number("step", step, above=0)
     if step * top >= 2 or step * rate >= 2:
         raise checks.fail(

@@ -186,10 +186,10 @@ def box_wavevectors(network: Network, largest: float) -> Tensor:
         raise checks.fail("box", "be periodic along every direction for plane waves", box)
     cell = network.cell.detach().double().cpu().numpy()
     vectors = 2 * math.pi * np.linalg.inv(cell).T
-    reach = [int(largest * np.linalg.norm(row) / (2 * math.pi)) + 1 for row in cell]
-    if np.prod([2.0 * r + 1 for r in reach]) > 1e7:
+    most = [int(largest * np.linalg.norm(row) / (2 * math.pi)) + 1 for row in cell]
+    if np.prod([2.0 * r + 1 for r in most]) > 1e7:
         raise checks.fail("largest wavenumber", "leave fewer than 1e7 wavevectors", largest)
-    turns = np.array(list(np.ndindex(*(2 * r + 1 for r in reach)))) - np.array(reach)
+    turns = np.array(list(np.ndindex(*(2 * r + 1 for r in most)))) - np.array(most)
     lead = turns[np.arange(len(turns)), (turns != 0).argmax(1)]
     q = turns[lead >= 0] @ vectors  # of q and -q the one whose first turn is positive
     length = np.linalg.norm(q, axis=1)
