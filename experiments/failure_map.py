@@ -20,10 +20,12 @@ from harness import Row
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import optimize, special
+from theory import FAILS, outline
 from torch import Tensor
 
 import torchchain as tc
 from torchchain import checks, plots
+from torchchain.ensemble.scene_file import regular_times
 from torchchain.evolvers import chebyshev, ode, symplectic
 from torchchain.evolvers.symplectic4 import PEFRL
 from torchchain.evolvers.verlet import VERLET
@@ -45,9 +47,25 @@ class Config:
     """bisections of every bracket"""
     points: int = 25
     """values at which every badness is drawn"""
+    n_particles: int = 256
+    """particles of the rings that the theory of disorder is held against"""
+    n_bands: int = 32
+    """bands of them"""
+    realizations: int = 400
+    """rings"""
+    strengths: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5)
+    """their disorders xi, normal masses"""
+    binary: tuple[float, ...] = (0.5,)
+    """the same, binary masses"""
+    step: float = 4.0
+    """time step"""
+    stop: float = 200.0
+    """last time"""
 
 
-SMOKE = Config(halvings=2, points=2)
+SMOKE = Config(
+    halvings=2, points=2, n_particles=32, n_bands=4, realizations=4, strengths=(0.3,), binary=(0.5,), stop=16.0
+)
 
 
 @dataclass(frozen=True)
@@ -517,6 +535,25 @@ def _hertz_waves() -> list[Edge]:
     ]  # fmt: skip
 
 
+def disorders(config: Config) -> list[tc.Disorder]:
+    """Those that the theory of disorder is held against."""
+    return [tc.Disorder("normal", xi) for xi in config.strengths] + [tc.Disorder("binary", xi) for xi in config.binary]
+
+
+def theory_off(config: Config) -> xarray.DataArray:
+    """Total variation of the theory of disorder, which needs no chains, from chains: (case, time, source)."""
+    times, found = regular_times(0.0, config.stop, config.step)[1:], []
+    for disorder in disorders(config):
+        scene = tc.Scene(
+            n_particles=config.n_particles, n_bands=config.n_bands, disorder=disorder, times=times,
+            realizations=config.realizations, seed=config.seed,
+        )  # fmt: skip
+        chains, theory = tc.band_transfer(scene, long_time=False).mean, tc.band_transfer(scene, "theory").mean
+        found.append(((theory - chains).abs().sum(-1) / 2).T)
+    place = {"time": ("time", list(times), harness.TIME), "source": np.arange(1, config.n_bands + 1)}
+    return xarray.DataArray(torch.stack(found).numpy(), place, ("case", "time", "source"))
+
+
 def measure(config: Config, device: str) -> xarray.Dataset:
     if device != "cpu":
         raise checks.fail("device", "be 'cpu': the edges are the methods', not the device's", repr(device))
@@ -545,6 +582,7 @@ def measure(config: Config, device: str) -> xarray.Dataset:
             "answer": ("edge", answers),
             "by_design": ("edge", [edge.public is None for edge in every]),
             "badness": (("edge", "relative"), np.array(curves), {"long_name": "badness over its limit"}),
+            "theory_off": theory_off(config),
         },
         {"relative": ("relative", relative, {"long_name": "value over the predicted edge"})},
     )  # fmt: skip
@@ -563,10 +601,12 @@ COLORS = {"raises": "C0", "warns": "C1", RIGHT: "0.5", "silent": "C3"}
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure = Figure(figsize=(plots.PAGE, 10), layout="constrained")
-    left, right = figure.subplots(2, 1, height_ratios=(1.8, 1))
-    _edges(left, data)
-    _curves(right, data)
+    figure = Figure(figsize=(plots.PAGE, 13), layout="constrained")
+    first, second, third = figure.subplots(3, 1, height_ratios=(1.8, 1, 1))
+    _edges(first, data)
+    _curves(second, data)
+    outline(third, data.theory_off, [f"{d.kind}, $\\xi$ = {d.strength:g}" for d in disorders(config)])
+    third.set_title(f"(c) theory of disorder: energies off by {FAILS:g} or more inside the lines")
     return figure
 
 
@@ -600,7 +640,12 @@ def _edges(ax: Axes, data: xarray.Dataset) -> None:
 
 def _symbols(words: str) -> str:
     """True symbols in place of the words of the table."""
-    for word, symbol in (("w_max^2", "$\\omega_{max}^2$"), ("w_max", "$\\omega_{max}$"), ("|lambda|", "$|\\lambda|$"), ("w step", "$\\omega$ step")):
+    for word, symbol in (
+        ("w_max^2", "$\\omega_{max}^2$"),
+        ("w_max", "$\\omega_{max}$"),
+        ("|lambda|", "$|\\lambda|$"),
+        ("w step", "$\\omega$ step"),
+    ):
         words = words.replace(word, symbol)
     return words
 
@@ -638,6 +683,14 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
             str(one.answer.values), bool(one.by_design)
         )
         rows.append(Row(f"{one.method.values}: {one.quantity.values}", float(one.found), note=note))
+    for disorder, off in zip(disorders(config), data.theory_off, strict=True):
+        bad = off > FAILS
+        note = f"{100 * float(bad.mean()):.0f} % of sources and times off by more than {FAILS:g}"
+        if bool(bad.any()):
+            times, bands = off.time[bad.any("source")].values, off.source[bad.any("time")].values
+            note += f": bands {bands[0]} to {bands[-1]}, t = {times[0]:g} to {times[-1]:g}"
+        label = f"theory of disorder, {disorder.kind} masses, xi = {disorder.strength:g}: worst source and time"
+        rows.append(Row(label, float(off.max()), note=note))
     return rows
 
 

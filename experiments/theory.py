@@ -213,9 +213,7 @@ def _draw_spectral(ax: Axes, data: xarray.Dataset, config: Config) -> None:
     for i, tone in enumerate(data.tone.values):
         ax.stairs(data.histogram[i], np.linspace(0, 2.6, HISTOGRAM + 1), color=f"C{i}", fill=True, alpha=0.3)
         ax.plot(data.frequency, data.spectral[i], color=f"C{i}", label=f"tone {tone}")
-    ax.set(
-        xlabel=r"frequency $\omega$", ylabel=r"$A_k(\omega)$; bars: chains", title=f"$\\xi$ = {config.strength:g}"
-    )
+    ax.set(xlabel=r"frequency $\omega$", ylabel=r"$A_k(\omega)$; bars: chains", title=f"$\\xi$ = {config.strength:g}")
     ax.legend(fontsize=8)
 
 
@@ -232,15 +230,20 @@ def _draw_cost(ax: Axes, data: xarray.Dataset, config: Config) -> None:
 
 
 def _draw_edges(ax: Axes, data: xarray.Dataset, config: Config) -> None:
-    """Lines around where a source's energies are wrong by FAILS or more."""
-    later = data.by_band.sel(time=slice(config.step, None))
-    for i, xi in enumerate(config.strengths):
-        smooth = gaussian_filter(later.isel(strength=i).values, 1.0)
-        ax.plot([], [], STYLES[i % len(STYLES)], color=f"C{i}", label=f"$\\xi$ = {xi:g}")
+    labels = [f"$\\xi$ = {xi:g}" for xi in config.strengths]
+    outline(ax, data.by_band.sel(time=slice(config.step, None)).rename(strength="case"), labels)
+
+
+def outline(ax: Axes, off: xarray.DataArray, labels: list[str]) -> None:
+    """Lines around where a source's energies are wrong by FAILS or more, of (case, time, source)."""
+    for i, label in enumerate(labels):
+        smooth = gaussian_filter(off.isel(case=i).values, 1.0)
+        style = STYLES[i % len(STYLES)]
+        ax.plot([], [], style, color=f"C{i}", label=label)
         if smooth.max() > FAILS > smooth.min() and min(smooth.shape) > 1:
-            ax.contour(later.time, later.source, smooth.T, [FAILS], colors=f"C{i}", linestyles=STYLES[i % len(STYLES)])
-    ax.set(xscale="log", xlabel=plots.TIME_LABEL, ylabel="source band", xlim=(config.step, config.stop), ylim=(1, config.n_bands + 1),
-           title=f"off by {FAILS:g}: inside")  # fmt: skip
+            ax.contour(off.time, off.source, smooth.T, [FAILS], colors=f"C{i}", linestyles=style)
+    ax.set(xscale="log", xlabel=plots.TIME_LABEL, ylabel="source band", xlim=(float(off.time[0]), float(off.time[-1])),
+           ylim=(1, off.sizes["source"] + 1), title=f"off by {FAILS:g}: inside")  # fmt: skip
     ax.legend(fontsize=8, loc="upper right")
 
 

@@ -65,6 +65,17 @@ def test_well_inside_its_edge_a_method_works(name):
     assert "Error" not in failure_map.answer(edge.public, 0.2 * edge.predicted)
 
 
+def test_the_theory_of_disorder_fails_with_the_disorder_and_most_for_binary_masses():
+    config = failure_map.Config(
+        n_particles=64, n_bands=8, realizations=60, strengths=(0.1, 0.5), binary=(0.5,), stop=16.0
+    )
+    weak, strong, binary = failure_map.theory_off(config)
+    assert float(weak.max()) < failure_map.FAILS
+    assert float(weak.mean()) < float(strong.mean()) < float(binary.mean())
+    assert float(binary.max()) > 2 * failure_map.FAILS
+    assert float(strong.isel(source=0).max()) < failure_map.FAILS  # the longest waves
+
+
 def test_every_stability_limit_of_the_registry_is_on_the_map():
     from torchchain.evolvers import ode
     from torchchain.master.solving import STABILITY

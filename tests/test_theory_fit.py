@@ -5,7 +5,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.theory import fit_disorder, theory_transfer, transfer_at
+from torchchain.theory import effective_medium, fit_disorder, theory_transfer, transfer_at
 
 TIMES = torch.arange(0, 31, 3, dtype=torch.float64)
 TONE, BAND = 22, 5
@@ -48,14 +48,13 @@ def test_energies_of_another_shape_are_refused(shape):
 
 def test_transfer_has_derivatives_in_strength_and_damping():
     strength, damping = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (0.2, 0.01))
-    share = transfer_at(strength, 32, 4, [2.0, 4.0], damping)[2]
+    share = transfer_at(strength, 32, 4, [2.0, 4.0], damping, kind="binary")[2]
     weight = torch.tensor([[0.0, 1.0, 2.0, -1.0], [1.0, 0.0, 1.0, 3.0]], dtype=torch.float64)
     (weight * share.square()).sum().backward()
 
     def loss(xi, rate):
-        return float(
-            (weight * theory_transfer(tc.Disorder(strength=xi), 32, 4, [2.0, 4.0], damping=rate).mean[2].square()).sum()
-        )
+        result = theory_transfer(tc.Disorder("binary", xi), 32, 4, [2.0, 4.0], damping=rate)
+        return float((weight * result.mean[2].square()).sum())
 
     # Richardson's fourth-order differences at other steps
     for found, function in (
@@ -64,6 +63,22 @@ def test_transfer_has_derivatives_in_strength_and_damping():
     ):
         wide, narrow = ((function(h) - function(-h)) / (2 * h) for h in (0.004, 0.002))
         assert float(found) == pytest.approx((4 * narrow - wide) / 3, rel=2e-4)
+
+
+@pytest.mark.parametrize("kind", ["normal", "uniform", "binary", "lognormal", "gamma"])
+def test_the_medium_is_differentiable_in_the_strength(kind):
+    def masses(strength):
+        found = effective_medium(tc.Disorder(kind), [0.5, 1.0, 1.6], broadening=0.1, strength=strength)
+        return torch.view_as_real(torch.stack([found.mass, found.resolvent]))
+
+    strength = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(masses, (strength,), eps=1e-5, atol=1e-6, rtol=1e-4)
+
+
+def test_derivative_of_the_transfer_at_no_disorder_is_zero():
+    strength = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    transfer_at(strength, 16, 2, [3.0])[1, 0, 1].backward()
+    assert float(strength.grad) == 0
 
 
 def test_newton_steps_with_the_derivative_find_the_strength():

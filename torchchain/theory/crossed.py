@@ -25,7 +25,17 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from torchchain.theory.ladder import DECAY, Stretch, Waves, coherent_energy, line, mirrored, source_scale, window_of
+from torchchain.theory.ladder import (
+    DECAY,
+    Stretch,
+    Waves,
+    coherent_energy,
+    line,
+    mirrored,
+    source_scale,
+    together,
+    window_of,
+)
 from torchchain.theory.law import Law
 from torchchain.theory.medium import coherent_mass, site_resolvent
 
@@ -90,7 +100,10 @@ def crossed_transfer(law: Law, waves: Waves, times: Tensor, edge: float) -> tupl
     stretch = Stretch(0.0, last, DECAY / period, step, cut, _SMOOTH, math.ceil((cut + 4 * _SMOOTH) / step))
     side, means = _side(law, waves, stretch)
     points, bands = stretch.points, waves.n_bands
-    coskr = _cosines(waves.wavenumbers, side.apart.shape[1])
+    *parts, coskr = together(
+        *(getattr(side, f.name) for f in fields(side)), _cosines(waves.wavenumbers, side.apart.shape[1])
+    )
+    side = _Side(*parts)
     spectrum = torch.empty(points, len(waves.sources) * bands, dtype=torch.complex128)
     for m in range(points):
         above = side.part(slice(points + m, 2 * points), False)
@@ -117,12 +130,12 @@ def fading(times: Tensor) -> Tensor:
     return 1 - gone.square() * (3 - 2 * gone)
 
 
-def _variance(law: Law, waves: Waves) -> float:
+def _variance(law: Law, waves: Waves) -> Tensor:
     """s: of the masses; for random stiffnesses theirs, over their mean squared, in place of the skew compliances'."""
-    if not waves.momentum:
-        return law.variance
-    stiffness = law.inverse()
-    return stiffness.variance / stiffness.mean**2
+    values = 1 / law.values if waves.momentum else law.values
+    mean = law.weights @ values
+    variance = law.weights @ (values - mean).square()
+    return variance / mean.square() if waves.momentum else variance
 
 
 def _cosines(wavenumbers: Tensor, count: int) -> Tensor:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchchain import checks
 from torchchain.chain import Disorder
-from torchchain.theory.transfer import theory_transfer
+from torchchain.theory.law import law_of
+from torchchain.theory.transfer import described, transfer_of_law
 
-_STEP = 1e-3  # of the central differences, relative to the strength; of the damping, absolute
 _WEAKEST = 1e-6
 
 
@@ -28,8 +30,8 @@ def transfer_at(
 ) -> Tensor:
     """``theory_transfer(...).mean``, [source, time, receiver], with its derivatives in strength and contact damping.
 
-    The derivatives are central differences, each of two more transfers: the medium is solved to 1e-11, so that they hold to
-    1e-5. The first derivative alone.
+    Derivatives are exact: forward mode goes through the whole solver, and through the coherent potential by the implicit function
+    theorem (one Newton step from the solution). Each takes the time of some three transfers. The first derivative alone.
 
     Args:
         strength: xi of the masses, a scalar; one that requires its gradient gets it by ``backward``.
@@ -53,33 +55,42 @@ def transfer_at(
         if value.ndim:
             raise checks.fail(name, "be a scalar", f"shape {tuple(value.shape)}")
 
-    def mean(xi: float, loss: float) -> Tensor:
-        disorder = Disorder(kind=kind, strength=xi, lower=lower)
-        return theory_transfer(disorder, n_particles, n_bands, times, tones, damping=loss).mean
+    disorder = Disorder(kind=kind, strength=float(strength.detach()), lower=lower)
+    times = checks.times("times", times).to(torch.float64)
+    law, waves = described(
+        disorder, n_particles, n_bands, tones, "periodic", None, "linear", float(damping.detach()), float(times[-1])
+    )
 
-    result: Tensor = _Differences.apply(strength, damping, mean)
+    given = (strength.detach().double(), damping.detach())
+
+    def mean(xi: Tensor, loss: Tensor) -> Tensor:
+        at = law if float(xi) < _WEAKEST else law_of(disorder, strength=xi)  # even in xi: without a slope at 0
+        return transfer_of_law(at, replace(waves, damping=loss if damping.requires_grad else float(loss)), times).mean
+
+    found: Tensor | None = None
+    slopes: list[Tensor | None] = []
+    for i, scalar in enumerate((strength, damping)):
+        if not scalar.requires_grad:
+            slopes.append(None)
+            continue
+        with forward_ad.dual_level():
+            moving = forward_ad.make_dual(given[i], torch.ones_like(given[i]))
+            found, slope = forward_ad.unpack_dual(mean(*(moving if j == i else given[j] for j in range(2))))
+            slopes.append(torch.zeros_like(found) if slope is None else slope)
+    result: Tensor = _Known.apply(strength, damping, mean(*given) if found is None else found, *slopes)
     return result
 
 
-class _Differences(torch.autograd.Function):
+class _Known(torch.autograd.Function):
+    """A function of two scalars whose value and slopes are known."""
+
     @staticmethod
-    def forward(ctx: Any, strength: Tensor, damping: Tensor, mean: Callable[[float, float], Tensor]) -> Tensor:
-        ctx.save_for_backward(strength, damping)
-        ctx.mean = mean
-        return mean(float(strength), float(damping))
+    def forward(ctx: Any, strength: Tensor, damping: Tensor, value: Tensor, *slopes: Tensor | None) -> Tensor:
+        ctx.save_for_backward(*slopes)
+        return value.clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        strength, damping = ctx.saved_tensors
-        xi, loss = float(strength), float(damping)
-        found: list[Tensor | None] = [None, None]
-        if ctx.needs_input_grad[0]:
-            low, high = max(xi * (1 - _STEP), 0.0), max(xi * (1 + _STEP), _WEAKEST)
-            change = (ctx.mean(high, loss) - ctx.mean(low, loss)) / (high - low)
-            found[0] = (gradients[0] * change).sum().to(strength)
-        if ctx.needs_input_grad[1]:
-            low, high = max(loss - _STEP, 0.0), loss + _STEP
-            change = (ctx.mean(xi, high) - ctx.mean(xi, low)) / (high - low)
-            found[1] = (gradients[0] * change).sum().to(damping)
-        return found[0], found[1], None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        found = (None if slope is None else (gradients[0] * slope).sum() for slope in ctx.saved_tensors)
+        return *found, None, None, None

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import torch
 from scipy import special
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchchain.theory.law import Law
 from torchchain.theory.medium import Levels, coherent_mass, site_resolvent
@@ -48,7 +49,7 @@ class Waves:
         sources: w_k^2 of the sources, (source,).
         source_bands: band of each source, from 0, (source,).
         momentum: whether sources start as momenta (the dual of stiffness disorder) and not as displacements.
-        damping: contact damping.
+        damping: contact damping; a tensor where derivatives follow it.
     """
 
     n_particles: int
@@ -56,7 +57,12 @@ class Waves:
     sources: Tensor
     source_bands: Tensor
     momentum: bool = False
-    damping: float = 0.0
+    damping: float | Tensor = 0.0
+
+    @property
+    def lossy(self) -> bool:
+        """Whether energy is lost, or its loss differentiated."""
+        return isinstance(self.damping, Tensor) or self.damping > 0
 
     @classmethod
     def of_tones(
@@ -199,24 +205,20 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
     block = min(used, max(1, _BLOCK // pairs))
     spectrum = torch.empty(block, len(waves.sources), waves.n_bands, dtype=torch.complex128)
     energy_in_time = torch.zeros(len(times), pairs, dtype=torch.float64)
-    window = window * math.sqrt(2.0)
-    squares = inner.square()
-    z_, squares_, mass_, argument_, g_, loss_, window_, source_, received_ = (
-        x.conj().resolve_conj() for x in (z, squares, mass, argument, g, loss, window, source, received)
-    )
+    window, inverse, squares = window * math.sqrt(2.0), 1 / z, inner.square()
+    own = loss * inverse.square() / 2
+    parts = together(squares, squares * g, mass, argument, g, z, inverse, own, source * (window / loss), received)
+    below_axis = [x.conj().resolve_conj() for x in parts]
     for m in range(used):
         above, below = slice(points + m, 2 * points), slice(points - m, 2 * (points - m))
-        z1, a, e1, g1, l1 = z[above], squares[above], argument[above], g[above], loss[above]
-        z2, b, e2, g2, l2 = z_[below], squares_[below], argument_[below], g_[below], loss_[below]
-        d_mass, d_argument = mass[above] - mass_[below], e1 - e2
-        vertex = a * b * d_mass / ((a * g1 - b * g2) - a * b * d_mass * (g1 - g2) / d_argument)
-        if waves.momentum:
-            energy = (z1 + z2).square() / (2 * z1 * z2)
-        else:
-            energy = (l1 / z1.square() + l2 / z2.square()) / 2 + 1 / (z1 * z2)
-        weight = window[above] * window_[below] * vertex * energy / (d_argument * l1 * l2)
-        left = source[:, above] * source_[:, below] * weight
-        spectrum[m % block] = left @ (received[:, above] - received_[:, below]).T
+        a, flow, mass1, e1, g1, z1, i1, own1, s1, r1 = (x[..., above] for x in parts)
+        b, flow2, mass2, e2, g2, z2, i2, own2, s2, r2 = (x[..., below] for x in below_axis)
+        vertex, d_argument = a * b * (mass1 - mass2), e1 - e2
+        vertex = vertex / ((flow - flow2) - vertex * (g1 - g2) / d_argument)
+        energy = (z1 + z2).square() / 2 * i1 * i2 if waves.momentum else own1 + own2 + i1 * i2
+        left = s1 * s2 * (vertex * energy / d_argument)
+        received_here = r1 - r2
+        spectrum[m % block] = left @ received_here.T
         if m % block == block - 1 or m == used - 1:
             some = slice(m - m % block, m + 1)
             angle = differences[some, None] * times
@@ -231,6 +233,16 @@ def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Ten
     rows = torch.arange(len(waves.sources))
     spread[rows, :, waves.source_bands] += coherent
     return spread
+
+
+def together(*tensors: Tensor) -> list[Tensor]:
+    """The same, all with a derivative (of zero) where forward mode follows one: it is slow with operands that have none."""
+    followed = [forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors]
+    if not any(followed):
+        return list(tensors)
+    return [
+        x if has else forward_ad.make_dual(x, torch.zeros_like(x)) for x, has in zip(tensors, followed, strict=True)
+    ]
 
 
 def line(waves: Waves, stretch: Stretch) -> tuple[Tensor, Tensor, Tensor]:
@@ -293,7 +305,7 @@ def coherent_energy(
 
 
 def _oscillator(
-    squared: Tensor, mass: float, damping: float, times: Tensor, momentum: bool
+    squared: Tensor, mass: float, damping: float | Tensor, times: Tensor, momentum: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Displacement, velocity and momentum of m u'' + d w^2 u' + w^2 u = 0, from u = 1 at rest or from momentum 1 at u = 0.
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ class Law:
 
     def moment(self, power: float) -> float:
         """Mean of value**power."""
-        return float((self.weights * self.values**power).sum())
+        return float((self.weights * self.values**power).sum().detach())
 
     @property
     def mean(self) -> float:
@@ -46,14 +47,14 @@ class Law:
     @property
     def variance(self) -> float:
         """Variance, strength**2 but for the cut at ``lower``."""
-        return float((self.weights * (self.values - self.mean) ** 2).sum())
+        return float((self.weights * (self.values - self.mean) ** 2).sum().detach())
 
     def inverse(self) -> Law:
         """The law of 1 / value."""
         return Law(1 / self.values, self.weights)
 
 
-def law_of(disorder: Disorder, nodes: int = 48) -> Law:
+def law_of(disorder: Disorder, nodes: int = 48, strength: Tensor | None = None) -> Law:
     """The law of a :class:`Disorder`, cut off at ``lower``, as a Gauss rule of its own.
 
     The density is laid on a fine Gauss-Legendre grid (in the logarithm for lognormal and gamma laws) and shortened by
@@ -62,6 +63,7 @@ def law_of(disorder: Disorder, nodes: int = 48) -> Law:
     Args:
         disorder: kind, strength and lower cut.
         nodes: of the short rule; fewer where the law has fewer values (a binary law has two).
+        strength: a scalar in place of the disorder's; values and weights carry its derivatives.
 
     Example:
         >>> from torchchain import Disorder
@@ -71,10 +73,42 @@ def law_of(disorder: Disorder, nodes: int = 48) -> Law:
     """
     checks.instance("disorder", disorder, Disorder)
     nodes = checks.integer("nodes", nodes, 2, _POINTS)
+    if strength is not None:
+        checks.instance("strength", strength, Tensor)
+        if strength.ndim:
+            raise checks.fail("strength", "be a scalar", f"shape {tuple(strength.shape)}")
+        disorder = replace(disorder, strength=float(strength.detach()))
     values, weights = _fine_rule(disorder)
     if len(values) > nodes:
         values, weights = _gauss_rule(values, weights, nodes)
-    return Law(torch.from_numpy(values), torch.from_numpy(weights / weights.sum()))
+    law = Law(torch.from_numpy(values), torch.from_numpy(weights / weights.sum()))
+    return law if strength is None or len(values) == 1 else _followed(law, disorder, strength)
+
+
+def _followed(law: Law, disorder: Disorder, strength: Tensor) -> Law:
+    """The same law as a differentiable function of the strength: values that move with it, or weights by their density."""
+    xi = disorder.strength
+    if disorder.kind in ("uniform", "binary"):
+        start, stop = (1 - xi, 1 + xi) if disorder.kind == "binary" else _ends(xi, disorder.lower)
+        half = strength * (1.0 if disorder.kind == "binary" else math.sqrt(3))
+        lowest = 1 - half if start > disorder.lower or disorder.kind == "binary" else torch.full_like(half, start)
+        return Law(lowest + (1 + half - lowest) * ((law.values - start) / (stop - start)), law.weights)
+
+    def height(xi: Tensor) -> Tensor:
+        if disorder.kind == "normal":
+            return -((law.values - 1) / xi).square() / 2
+        if disorder.kind == "lognormal":
+            variance = torch.log1p(xi.square())
+            return -(law.values.log() + variance / 2).square() / (2 * variance)
+        return (law.values.log() - law.values) / xi.square()
+
+    weights = law.weights * torch.exp(height(strength) - height(torch.as_tensor(xi, dtype=law.values.dtype)))
+    return Law(law.values, weights / weights.sum())
+
+
+def _ends(xi: float, lower: float) -> tuple[float, float]:
+    """Of the uniform law."""
+    return max(lower, 1 - math.sqrt(3) * xi), 1 + math.sqrt(3) * xi
 
 
 def _fine_rule(disorder: Disorder) -> tuple[np.ndarray, np.ndarray]:
@@ -85,8 +119,7 @@ def _fine_rule(disorder: Disorder) -> tuple[np.ndarray, np.ndarray]:
         return np.array([1 - xi, 1 + xi]), np.array([0.5, 0.5])
     x, w = _legendre()
     if disorder.kind == "uniform":
-        start, stop = max(lower, 1 - np.sqrt(3) * xi), 1 + np.sqrt(3) * xi
-        return _scaled(x, start, stop), w
+        return _scaled(x, *_ends(xi, lower)), w
     far = -special.ndtri(_TAIL)
     if disorder.kind == "normal":
         values = _scaled(x, max(lower, 1 - far * xi), 1 + far * xi)

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from torchchain.theory.ladder import Waves
 from torchchain.theory.law import Law
-from torchchain.theory.medium import coherent_mass, site_resolvent, wavenumber
+from torchchain.theory.medium import coherent_mass, plain, site_resolvent, wavenumber
 
 _LEAVING = 3  # power with which the first crossed scattering gives way
 _ABOVE = 1e-8  # the real axis is taken from above, at this distance times the frequency
@@ -156,7 +156,7 @@ class _Line:
         band = min(2 / math.sqrt(law.mean), edge / 1.2)
         w = np.unique(np.concatenate([np.linspace(edge * 1e-4, edge, 300), np.linspace(0.8 * band, 1.2 * band, 300)]))
         mass, _ = coherent_mass(self._above(torch.from_numpy(w)), law)
-        self._mass = scipy.interpolate.CubicSpline(w, mass.numpy())
+        self._mass = scipy.interpolate.CubicSpline(w, plain(mass).numpy())
 
     @staticmethod
     def _above(w: Tensor) -> Tensor:

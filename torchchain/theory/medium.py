@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchchain import checks
 from torchchain.chain import Disorder
@@ -84,7 +85,11 @@ class EffectiveMedium:
 
 
 def effective_medium(
-    disorder: Disorder, frequencies: Any, n_particles: int | None = None, broadening: float = _ABOVE_THE_AXIS
+    disorder: Disorder,
+    frequencies: Any,
+    n_particles: int | None = None,
+    broadening: float = _ABOVE_THE_AXIS,
+    strength: Tensor | None = None,
 ) -> EffectiveMedium:
     """The coherent potential of a chain with random masses, by quadrature over their whole law.
 
@@ -96,15 +101,21 @@ def effective_medium(
         frequencies: w > 0, (frequency,).
         n_particles: of a ring, whose q are 2 pi n / N; None for the infinite chain.
         broadening: imaginary part of the frequency. A ring has separate levels below its level spacing, pi / N or so.
+        strength: a scalar in place of the disorder's; all that depends on it can be differentiated by ``backward``.
 
     Raises:
-        FieldError: for frequencies that are not positive.
+        FieldError: for frequencies that are not positive, or a strength that is no scalar.
 
     Example:
         >>> from torchchain import Disorder
         >>> medium = effective_medium(Disorder(strength=0.3), [0.5, 1.0, 1.5])
         >>> [round(x, 1) for x in medium.mean_free_path.tolist()]
         [84.6, 17.3, 4.8]
+        >>> xi = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+        >>> path = effective_medium(Disorder(), [1.0], strength=xi).mean_free_path.sum()
+        >>> path.backward()
+        >>> round(float(xi.grad / path) * 0.3, 1)  # nearly as 1 / xi^2
+        -1.9
     """
     checks.instance("disorder", disorder, Disorder)
     w = checks.real_tensor("frequencies", frequencies).to(torch.float64)
@@ -115,7 +126,7 @@ def effective_medium(
         n_particles = checks.integer("n_particles", n_particles, 2)
     broadening = checks.number("broadening", broadening, above=0)
     z = torch.complex(w, torch.full_like(w, broadening))
-    mass, residual = coherent_mass(z, law_of(disorder), n_particles)
+    mass, residual = coherent_mass(z, law_of(disorder, strength=strength), n_particles)
     return _described(w, z, mass, n_particles, residual)
 
 
@@ -152,15 +163,19 @@ def coherent_mass(
     """mu(z) for complex frequencies with Re z > 0 and Im z > 0, (frequency,), and the largest residual.
 
     Damped iteration of mu = s - 1 / H(s), s = mu + 1 / (z^2 g), H(s) = < 1 / (s - m) >, which is the condition of no
-    scattering and converges in the upper half-plane; then Newton's method.
+    scattering and converges in the upper half-plane; then Newton's method. Where z or the law carry derivatives, forward or
+    backward, one more Newton step from the solution, whose slope is a constant, has those of the implicit function.
     """
-    values = law.values.to(z.real)
-    if len(values) == 1:
-        return torch.full_like(z, float(values[0])), 0.0
-    weights = law.weights.to(z)
-    mass = torch.full_like(z, law.mean) if start is None else start.clone()
+    if len(law.values) == 1:
+        return torch.full_like(z, float(law.values[0])), 0.0
+    followed = _followed(z, law.values, law.weights)
+    whole, z = z, plain(z)
+    values, weights = plain(law.values), plain(law.weights).to(z)
+    mass = torch.full_like(z, law.mean) if start is None else plain(start).clone()
 
-    def mismatch(squared: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def mismatch(
+        squared: Tensor, mass: Tensor, values: Tensor = values, weights: Tensor = weights
+    ) -> tuple[Tensor, Tensor]:
         g, slope = _resolvent_and_slope(squared * mass, n_particles)
         apart = 1 / (squared * g)
         inverse = 1 / ((mass + apart)[:, None] - values)
@@ -185,7 +200,22 @@ def coherent_mass(
         if start is None and step < _DAMPED_STEPS:
             good &= off.abs() < 1e-3
         mass[active] = torch.where(good, trial, here - 0.5 * off)
+    if followed:
+        off, slope = mismatch(whole.square(), mass, law.values, law.weights.to(z))
+        mass = mass - off / plain(slope)
     return mass, float(residual.max())
+
+
+def plain(tensor: Tensor) -> Tensor:
+    """Without derivatives."""
+    return forward_ad.unpack_dual(tensor).primal.detach()
+
+
+def _followed(*tensors: Tensor) -> bool:
+    """Whether any carries derivatives."""
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        return True
+    return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
 def site_resolvent(argument: Tensor, n_particles: int | Levels | None = None) -> Tensor:

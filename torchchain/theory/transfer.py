@@ -124,17 +124,17 @@ def transfer_of_law(
     law: Law, waves: Waves, times: Tensor, localization: bool = True, numbers: Return = MEASURED, decay: float = DECAY
 ) -> TheoryTransfer:
     """:func:`theory_transfer` of what :func:`described` made of its arguments; times (time,), to 5000."""
-    n_bands, damping, sources = waves.n_bands, waves.damping, len(waves.sources)
+    n_bands, lossy, sources = waves.n_bands, waves.lossy, len(waves.sources)
     with single_thread(), torch.no_grad():
         edges = spectrum_edges(law)
-        late = (times > FADING) & (damping == 0)
+        late = (times > FADING) & (not lossy)
         asked = (
             torch.cat([times[~late], times.new_tensor([FADING / 2, FADING])]).unique() if bool(late.any()) else times
         )
         ladder = ladder_transfer(law, waves, asked, edges, decay)
         total = ladder.sum(-1)
         closure = 0.0
-        if damping == 0:
+        if not lossy:
             closure = float((total - 1).abs().max())
             ladder = ladder / total[..., None]
         mean = ladder[:, torch.searchsorted(asked, times.clamp(max=float(asked[-1])))]
@@ -145,7 +145,7 @@ def transfer_of_law(
         crossed, coherent = torch.zeros(sources, len(times), n_bands, dtype=torch.float64), torch.zeros_like(error)
         if localization and bool(early.any()) and law.variance > 0:
             crossed[:, early], coherent[:, early] = crossed_transfer(law, waves, times[early], edges[0])
-            if damping == 0:  # rounding
+            if not lossy:  # rounding
                 crossed[torch.arange(sources), :, waves.source_bands] -= crossed.sum(-1)
         sharp = localization and 1 < len(law.values) <= MOST_VALUES and isinstance(waves.ring, int)
         if sharp:
@@ -163,7 +163,7 @@ def transfer_of_law(
                     _exchange(mean[s], int(waves.source_bands[s]), medium[s] + part * coherent[s], exact[s])
             else:
                 error[s] += _distance(change)
-            if damping == 0:
+            if not lossy:
                 final = pattern.sum(-1)
                 long_time[s] = plain + final if localization else plain
                 long_error[s] = (_SHAPE_ERROR if localization else 1.0) * _distance(final)
