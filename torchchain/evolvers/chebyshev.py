@@ -21,7 +21,7 @@ kernels of :mod:`stencil` do the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -59,34 +59,28 @@ def start(
     Raises:
         FieldError: for an option out of range; for a ``bound`` that a squared frequency of the chain exceeds.
     """
-    accuracy = checks.number("accuracy", accuracy, above=0, at_most=0.1)
-    tolerance = max(accuracy / SEGMENTS, ROUNDING)
-    possible = _compilable(chain, state)
-    if compiled is None:
-        compiled = possible
-    elif not isinstance(compiled, bool):
-        raise checks.FieldTypeError(f"compiled must be True, False or None, got {checks.shown(compiled)}")
-    elif compiled and not possible:
-        raise checks.fail(
-            "compiled",
-            "be False for tensors off the CPU, that require gradients, or that are neither float32 nor float64",
-            compiled,
-        )
+    tensors = (chain.masses, chain.contact_stiffness, state.displacement, state.velocity)
+    tolerance, compiled = settled(accuracy, compiled, tensors)
     if compiled:
         return CompiledAdvance(chain, state, bound, tolerance)
     return _plain(chain, state, highest_frequency(chain, bound), tolerance)
 
 
-def _compilable(chain: Chain, state: State) -> bool:
-    """Whether the Numba kernels can treat these tensors."""
-    tensors = (chain.masses, chain.contact_stiffness, state.displacement, state.velocity)
-    return all(
+def settled(accuracy: float, compiled: bool | None, tensors: Iterable[Tensor]) -> tuple[float, bool]:
+    """What truncation may leave out in a segment, and whether the Numba kernels run, which cannot treat all tensors."""
+    accuracy = checks.number("accuracy", accuracy, above=0, at_most=0.1)
+    possible = all(
         x.device.type == "cpu"
         and x.dtype in (torch.float32, torch.float64)
         and not (x.requires_grad and torch.is_grad_enabled())
         and not checks.is_transformed(x)
         for x in tensors
     )
+    if not isinstance(compiled, bool | None):
+        raise checks.FieldTypeError(f"compiled must be True, False or None, got {checks.shown(compiled)}")
+    if compiled and not possible:
+        raise checks.fail("compiled", "be False for tensors off the CPU, or that require gradients", compiled)
+    return max(accuracy / SEGMENTS, ROUNDING), possible if compiled is None else compiled
 
 
 def highest_frequency(chain: Chain, bound: float | Tensor | None = None) -> Tensor:
@@ -121,13 +115,7 @@ def rounded_up(frequency: np.ndarray) -> np.ndarray:
 
 def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
     """A user's bound of the squared frequency, (*batch,), float64; see :func:`highest_frequency`."""
-    squared = checks.real_tensor("bound", bound).to(chain.masses.device, torch.float64)
-    checks.first_bad("bound", "be positive", squared, squared <= 0)
-    if squared.shape not in (torch.Size(), chain.batch_shape):
-        raise checks.fail(
-            "bound", f"be a number or have shape {tuple(chain.batch_shape)}", f"shape {tuple(squared.shape)}"
-        )
-    squared = squared.expand(chain.batch_shape)
+    squared = given_bound(bound, chain.masses)
     double = replace(chain, masses=chain.masses.double())
     checks.first_bad(
         "bound",
@@ -141,6 +129,15 @@ def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
     rule = f"be at most {WASTE:g} times chain.squared_frequency_bound(): work grows as its root"
     checks.first_bad("bound", rule, squared, squared > own, "chain")
     return squared
+
+
+def given_bound(bound: float | Tensor, masses: Tensor) -> Tensor:
+    """A bound, one number or one for each of the ``masses`` (*batch, particle), as (*batch,), float64, positive."""
+    squared, batch = checks.real_tensor("bound", bound).to(masses.device, torch.float64), masses.shape[:-1]
+    checks.first_bad("bound", "be positive", squared, squared <= 0)
+    if squared.shape not in (torch.Size(), batch):
+        raise checks.fail("bound", f"be a number or have shape {tuple(batch)}", f"shape {tuple(squared.shape)}")
+    return squared.expand(batch)
 
 
 def check_work(times: Tensor, frequency: float) -> None:

@@ -115,7 +115,7 @@ def _propagator(matrix: Tensor, initial: Tensor) -> Callable[[Tensor], Tensor]:
         spectral, by_steps = _by_eigenvectors(values, vectors, inverse, initial), None
     else:
         spectral = _by_eigenvectors(values[good], vectors[good], inverse[good], initial[good])
-        by_steps = _by_exponentials(matrix[~good], initial[~good])
+        by_steps = by_exponentials(matrix[~good], initial[~good])
 
     def propagate(times: Tensor) -> Tensor:
         result = spectral(times)
@@ -139,7 +139,7 @@ def _by_eigenvectors(values: Tensor, vectors: Tensor, inverse: Tensor, initial: 
     return propagate
 
 
-def _by_exponentials(matrix: Tensor, initial: Tensor) -> Callable[[Tensor], Tensor]:
+def by_exponentials(matrix: Tensor, initial: Tensor) -> Callable[[Tensor], Tensor]:
     """One matrix exponential per interval of a new length, one product per output time."""
     now, y = 0.0, initial
     length, exponential = 0.0, torch.eye(matrix.shape[-1]).to(matrix).expand_as(matrix)

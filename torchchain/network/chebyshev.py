@@ -23,8 +23,8 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import State
 from torchchain.evolvers.chebyshev import METHOD as CHAINS
-from torchchain.evolvers.chebyshev import check_work, expanded, later_times, rounded_up
-from torchchain.evolvers.expansion import LEAP, LONGEST, ROUNDING, SEGMENTS, SHARED_PHASE
+from torchchain.evolvers.chebyshev import check_work, expanded, given_bound, later_times, rounded_up, settled
+from torchchain.evolvers.expansion import LEAP, LONGEST, SHARED_PHASE
 from torchchain.evolvers.method import Advance
 from torchchain.modes import phase
 from torchchain.network.layouts import Run, layout_of
@@ -48,24 +48,13 @@ def start(
         FieldError: for an option out of range.
         UnstableError: for a network that is not stable.
     """
-    accuracy = checks.number("accuracy", accuracy, above=0, at_most=0.1)
-    tolerance = max(accuracy / SEGMENTS, ROUNDING)
+    values = (network.masses, network.stiffness, network.tension, network.positions, state.displacement, state.velocity)
+    tolerance, compiled = settled(accuracy, compiled, map(torch.as_tensor, values))
     check_stability(network)
     frequency = highest_frequency(network, bound)
-    possible = _compilable(network, state)
-    if compiled is None:
-        compiled = possible
-    elif checks.truth("compiled", compiled) and not possible:
-        raise checks.fail("compiled", "be False for tensors off the CPU or that require gradients", compiled)
     if compiled:
         return CompiledAdvance(network, state, frequency, tolerance)
     return _plain(network, state, frequency, tolerance)
-
-
-def _compilable(network: Network, state: State) -> bool:
-    values = (network.masses, network.stiffness, network.tension, network.positions, state.displacement, state.velocity)
-    tensors = [torch.as_tensor(x) for x in values]
-    return all(x.device.type == "cpu" and not (x.requires_grad and torch.is_grad_enabled()) for x in tensors)
 
 
 def highest_frequency(network: Network, bound: float | Tensor | None = None) -> Tensor:
@@ -82,13 +71,7 @@ def highest_frequency(network: Network, bound: float | Tensor | None = None) -> 
         if bound is None:
             squared = network.squared_frequency_bound()
         else:
-            squared = checks.real_tensor("bound", bound).to(network.masses.device, torch.float64)
-            checks.first_bad("bound", "be positive", squared, squared <= 0)
-            if squared.shape not in (torch.Size(), network.batch_shape):
-                raise checks.fail(
-                    "bound", f"be a number or have shape {tuple(network.batch_shape)}", f"shape {tuple(squared.shape)}"
-                )
-            squared = squared.expand(network.batch_shape)
+            squared = given_bound(bound, network.masses)
             exceeded = torch.zeros(network.batch_shape, dtype=torch.bool, device=squared.device)
             for member in np.ndindex(*network.batch_shape):
                 exceeded[member] = exceeds(network, float(squared[member]), member)

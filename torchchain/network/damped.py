@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import State
+from torchchain.evolvers.damped import by_exponentials
 from torchchain.evolvers.method import Advance, Method
 from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network
@@ -34,37 +35,22 @@ def start(network: Network, state: State) -> Advance:
     y = torch.cat([(field * state.displacement).flatten(-2) * top, (field * state.velocity).flatten(-2)], -1)
     members = y.shape[batch:-1]
     y = y.reshape(*network.batch_shape, -1, 2 * n * c)
-    now, length = 0.0, -1.0
-    exponential = matrix
-    initial: Tensor | None = None
-
-    def states(y: Tensor) -> tuple[Tensor, Tensor]:
-        y = y.reshape(*network.batch_shape, *members, 2, n, c)
-        return y[..., 0, :, :] / top[..., None] / field, y[..., 1, :, :] / field
-
-    def energy(u: Tensor, v: Tensor) -> Tensor:
-        return (network.align(network.masses, v) * v.square()).sum((-2, -1)) / 2 + network.bond_energy(u).sum(-1)
+    propagate = by_exponentials(matrix, y)
+    initial = _energy(network, state.displacement, state.velocity)
 
     def advance(times: Tensor) -> NetworkTrajectory:
-        nonlocal y, now, length, exponential, initial
-        if initial is None:
-            initial = energy(*states(y))
-        displacement, velocity, lost = [], [], []
-        for t in times.tolist():
-            interval = t - now
-            if abs(interval - length) > 1e-12 * interval:
-                length, exponential = interval, torch.linalg.matrix_exp(matrix * interval)
-            y = y @ exponential.mT if interval > 0 else y
-            u, v = states(y)
-            displacement.append(u)
-            velocity.append(v)
-            lost.append(initial - energy(u, v))
-            now = t
-        return NetworkTrajectory(
-            times, torch.stack(displacement, -3), torch.stack(velocity, -3), dissipated=torch.stack(lost, -1)
-        )
+        z = propagate(times).reshape(*network.batch_shape, *members, len(times), 2, n, c)
+        u, v = (part / field.unsqueeze(-3) for part in z.unbind(-3))
+        u = u / top[..., None, None]
+        return NetworkTrajectory(times, u, v, dissipated=initial[..., None] - _energy(network, u, v))
 
     return advance
+
+
+def _energy(network: Network, displacement: Tensor, velocity: Tensor) -> Tensor:
+    """Energy of every state, (*batch, *any)."""
+    kinetic = (network.align(network.masses, velocity) * velocity.square()).sum((-2, -1)) / 2
+    return kinetic + network.bond_energy(displacement).sum(-1)
 
 
 METHOD = Method(
