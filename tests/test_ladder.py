@@ -624,6 +624,7 @@ def test_families_from_the_command_line(family, tmp_path, capsys):
     out = tmp_path / "family"
     assert main(["family", *files, "--out", str(out)]) == 0
     assert "calibrated at 0.1, 0.2, 0.3, 0.4" in capsys.readouterr().out
+    assert "left out and predicted by the others" in (out / "report.html").read_text(encoding="utf-8")
     model, predicted = str(out / "model.safetensors"), tmp_path / "predicted"
     with warnings.catch_warnings():
         warnings.simplefilter("error", PredictionWarning)

@@ -29,17 +29,15 @@ def _join(paths: list[Path], out: Path, arguments: list[str], began: float) -> N
     family = MasterFamily([MasterEquation.load(path) for path in paths])
     times = torch.linspace(0, 500, 101, dtype=torch.float64)[1:]
     left_out = family.leave_one_out(times)
-    outputs.write(
-        out,
-        {
-            "model.safetensors": family.save,
-            "run.json": outputs.run_record(
-                arguments, "", "cpu", began, {}, strengths=list(family.strengths), left_out=left_out,
-                models=[{"path": str(path.resolve()), "sha256": outputs.sha256(path)} for path in paths],
-            ),
-        },
+    title = f"disorder 0 to {family.strengths[-1]:g}, calibrated at {', '.join(f'{xi:g}' for xi in family.strengths)}"
+    told = "left out and predicted by the others, 0 < t <= 500"
+    written = outputs.reported(
+        out, arguments, "", "cpu", began, {}, title=title, strengths=list(family.strengths), left_out=left_out,
+        models=[{"path": str(path.resolve()), "sha256": outputs.sha256(path)} for path in paths],
+        measured=[(f"total variation at disorder {strength:g}, {told}", off, None) for strength, off in left_out],
     )  # fmt: skip
-    print(f"disorder 0 to {family.strengths[-1]:g}, calibrated at {', '.join(f'{xi:g}' for xi in family.strengths)}")
+    outputs.write(out, {"model.safetensors": family.save, **written})
+    print(title)
     for strength, distance in left_out:
-        print(f"left out and predicted by the others, 0 < t <= 500: {strength:g}, total variation {distance:.4f}")
+        print(f"{told}: {strength:g}, total variation {distance:.4f}")
     print(f"results in {out}")

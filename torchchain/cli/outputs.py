@@ -225,35 +225,17 @@ def told_warnings() -> Iterator[list[str]]:
 def reported(
     out: Path, arguments: Sequence[str], config: str, device: str, began: float, stages: dict[str, float], **more: Any
 ) -> dict[str, Writer]:
-    """The writers of report.html and of run.json, to be written last.
+    """The writers of report.html and of run.json, to be written last: what is needed to make the run again, and to know it again.
 
     Args:
         out: the folder of the run.
-        arguments, config, device, began, stages, more: of the record; for the report also what :func:`report.page` tells.
+        arguments: the command, recorded with the folder it was given in.
+        config: its resolved settings, of which a hash is recorded, as of all files.
+        device: recorded with versions, threads and git revision.
+        began, stages: seconds.
+        more: further fields of the record, those that :func:`report.page` tells among them.
     """
-    record = _record(arguments, config, device, began, stages, more)
-
-    def page(path: Path) -> None:
-        told = report.page({**record, "out": str(out.absolute())}, path.parent)
-        path.write_text(told, encoding="utf-8")
-
-    return {report.REPORT: page, RECORD: _recorded(record)}
-
-
-def run_record(
-    arguments: Sequence[str], config: str, device: str, began: float, stages: dict[str, float], **more: Any
-) -> Writer:
-    """A writer of run.json, to be written last: what is needed to make the run again, and to know it again.
-
-    Command and folder it was given in, hashes of config and files, versions, device, threads, durations, git revision.
-    """
-    return _recorded(_record(arguments, config, device, began, stages, more))
-
-
-def _record(
-    arguments: Sequence[str], config: str, device: str, began: float, stages: dict[str, float], more: dict[str, Any]
-) -> dict[str, Any]:
-    return {
+    record = {
         "command": shlex.join(["torchchain", *arguments]),
         "arguments": list(arguments),
         "working_directory": os.getcwd(),
@@ -269,13 +251,16 @@ def _record(
         **more,
     }
 
+    def page(path: Path) -> None:
+        told = report.page({**record, "out": str(out.absolute())}, path.parent)
+        path.write_text(told, encoding="utf-8")
 
-def _recorded(record: dict[str, Any]) -> Writer:
     def writer(path: Path) -> None:
-        record["files"] = {beside.name: sha256(beside) for beside in sorted(path.parent.iterdir())}
-        path.write_text(json.dumps(_strict(record), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        files = {beside.name: sha256(beside) for beside in sorted(path.parent.iterdir())}
+        text = json.dumps(_strict({**record, "files": files}), indent=2, allow_nan=False)
+        path.write_text(text + "\n", encoding="utf-8")
 
-    return writer
+    return {report.REPORT: page, RECORD: writer}
 
 
 def sha256(path: str | Path) -> str:

@@ -12,7 +12,7 @@ from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State
 from torchchain.energy.bands import check_bands
-from torchchain.energy.space import require_linear
+from torchchain.energy.space import positive, require_linear
 from torchchain.modes.motion import change_basis, modal_motion
 from torchchain.modes.spectrum import NormalModes, normal_modes
 
@@ -64,12 +64,8 @@ def modal_band_energy(
     else:  # -K s_j = w_j^2 M s_j
         force = modes.frequencies.square()[..., :, None] * momentum
         energy = energy + (change_basis(position, force) * shape) @ bins
-    bands, total = energy[..., :-1], energy[..., -1:]
-    if not normalize:
-        return bands
-    bad = ~((total > 0) & total.isfinite())
-    checks.first_bad("total energy", "be positive and finite to normalize", total[..., 0], bad[..., 0], "time")
-    return bands / total
+    bands = energy[..., :-1]
+    return bands / positive(energy[..., -1])[..., None] if normalize else bands
 
 
 def _real_transform(shapes: Tensor) -> Tensor:

@@ -181,7 +181,7 @@ def energy_center(energy: Tensor) -> Tensor:
         [2.5]
     """
     energy = _per_particle(energy)
-    return (energy @ _sites(energy)) / _positive_total(energy)
+    return (energy @ _sites(energy)) / positive(energy.sum(-1), purpose="")
 
 
 def energy_width(energy: Tensor) -> Tensor:
@@ -195,7 +195,7 @@ def energy_width(energy: Tensor) -> Tensor:
     """
     energy = _per_particle(energy)
     offset = _sites(energy) - energy_center(energy)[..., None]
-    return (offset.square() * energy).sum(-1) / _positive_total(energy)
+    return (offset.square() * energy).sum(-1) / positive(energy.sum(-1), purpose="")
 
 
 def _per_particle(energy: Tensor) -> Tensor:
@@ -209,7 +209,8 @@ def _sites(energy: Tensor) -> Tensor:
     return torch.arange(1, energy.shape[-1] + 1, dtype=energy.dtype, device=energy.device)
 
 
-def _positive_total(energy: Tensor) -> Tensor:
-    total = energy.sum(-1)
-    checks.first_bad("total energy", "be positive and finite", total, ~((total > 0) & total.isfinite()), "time")
+def positive(total: Tensor, axis: str = "time", purpose: str = " to normalize") -> Tensor:
+    """Total energies that shares are taken of: an error for one that is not positive and finite."""
+    bad = ~((total > 0) & total.isfinite())
+    checks.first_bad("total energy", f"be positive and finite{purpose}", total, bad, axis)
     return total

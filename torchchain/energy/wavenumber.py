@@ -11,7 +11,7 @@ from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.energy.bands import bin_energy, check_bands
-from torchchain.energy.space import DEFINITIONS, EnergyMatrices, checked, require_linear
+from torchchain.energy.space import DEFINITIONS, EnergyMatrices, checked, positive, require_linear
 from torchchain.modes.motion import change_basis, modal_amplitudes
 from torchchain.modes.spectrum import NormalModes, modes_of, normal_modes
 
@@ -150,14 +150,7 @@ def zero_wavenumber_share(chain: Chain, trajectory: Trajectory) -> Tensor:
 
 
 def _normalized(part: Tensor, energy: Tensor) -> Tensor:
-    total = energy.sum(-1, keepdim=True)
-    _check_total(total[..., 0], "time")
-    return part / total
-
-
-def _check_total(total: Tensor, axis: str) -> None:
-    bad = ~((total > 0) & total.isfinite())
-    checks.first_bad("total energy", "be positive and finite to normalize", total, bad, axis)
+    return part / positive(energy.sum(-1))[..., None]
 
 
 def long_time_band_energy(
@@ -220,7 +213,7 @@ def long_time_band_energy(
     if not normalize:
         return bands
     total = energy.sum(-1, keepdim=True)
-    _check_total(total[..., 0], "state")
+    positive(total[..., 0], "state")
     return bands / total
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import State
 from torchchain.chain.states import Trajectory
+from torchchain.energy.space import positive
 from torchchain.network.lattices import Lattice, uniform_stiffness
 from torchchain.network.modal import amplitudes
 from torchchain.network.modes import NetworkModes, normal_modes
@@ -198,13 +199,8 @@ def _made_weights(bands: ShellBands, shape: tuple[int, ...], motion: str, force:
 
 def _shares(energy: Tensor, normalize: bool, axis: str) -> Tensor:
     """The bands, over the sum in the last column where they are to be normalized."""
-    total = energy[..., -1]
-    if not normalize:
-        return energy[..., :-1]
-    checks.first_bad(
-        "total energy", "be positive and finite to normalize", total, ~((total > 0) & total.isfinite()), axis
-    )
-    return energy[..., :-1] / total[..., None]
+    bands = energy[..., :-1]
+    return bands / positive(energy[..., -1], axis)[..., None] if normalize else bands
 
 
 @dataclass(frozen=True, eq=False)

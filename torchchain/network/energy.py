@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.states import Trajectory
+from torchchain.energy.space import positive
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import check_trajectory
 
@@ -195,6 +196,4 @@ def radial_profile(network: Network, energy: Tensor, origin: int | Any, edges: A
 
 def _share(energy: Tensor) -> Tensor:
     energy = checks.real_tensor("energy", energy)
-    total = energy.sum(-1)
-    checks.first_bad("total energy", "be positive and finite", total, ~((total > 0) & total.isfinite()), "time")
-    return energy / total[..., None]
+    return energy / positive(energy.sum(-1), purpose="")[..., None]

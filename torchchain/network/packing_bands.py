@@ -11,6 +11,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import State
 from torchchain.chain.states import Trajectory
+from torchchain.energy.space import positive
 from torchchain.network.disorder import uniform
 from torchchain.network.networks import Network
 from torchchain.network.wavenumber import POLARIZATIONS, box_wavevectors, plane_wave_energy, plane_waves, shell_energy
@@ -120,12 +121,7 @@ def packing_band_energy(
     shells = shell_energy(waves.lengths, waves.energy, bands.edges).transpose(-2, -1).flatten(-2)
     other = waves.remainder + waves.energy[..., 0, :].sum(-1)
     energy = torch.cat([shells, other[..., None]], dim=-1)
-    if not checks.truth("normalize", normalize):
-        return energy
-    total = energy.sum(-1, keepdim=True)
-    bad = ~((total[..., 0] > 0) & total[..., 0].isfinite())
-    checks.first_bad("total energy", "be positive and finite to normalize", total[..., 0], bad, "time")
-    return energy / total
+    return energy / positive(energy.sum(-1))[..., None] if checks.truth("normalize", normalize) else energy
 
 
 def band_starts(network: Network, bands: PackingBands, realization: int = 0, seed: int = 0) -> State:
