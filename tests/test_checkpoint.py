@@ -83,7 +83,8 @@ def whole():
 
 
 SERVER = multiprocessing.get_context("forkserver")  # forks from a process that has no threads yet
-SERVER.set_forkserver_preload(["torchchain.cli.dispatch", "test_checkpoint"])
+LATE = ["scipy.optimize", "xarray", "h5netcdf", "matplotlib.figure", "matplotlib.backends.backend_agg"]
+SERVER.set_forkserver_preload(["torchchain.cli.dispatch", "test_checkpoint", *LATE])
 
 
 def command_in_a_process(arguments, prepare):

@@ -259,7 +259,8 @@ def test_a_family_is_small_and_near_at_unseen_strengths():
     def ensemble(strength, seed):
         disorder = tc.Disorder(strength=strength)
         return tc.band_transfer(
-            tc.Scene(n_particles=128, n_bands=B, realizations=100, seed=seed, times=times, disorder=disorder)
+            tc.Scene(n_particles=128, n_bands=B, realizations=100, seed=seed, times=times, disorder=disorder),
+            starts=False,
         )
 
     family = tc.calibrate_family([ensemble(strength, 0) for strength in (0.05, 0.1, 0.2, 0.3, 0.5)])
