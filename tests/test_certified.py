@@ -22,7 +22,8 @@ LATE = torch.cat([torch.zeros(1), torch.logspace(-4, 6, 600)]).double()
 
 
 def ensemble(disorder, **settings):
-    return tc.band_transfer(tc.Scene(n_particles=128, n_bands=B, realizations=60, disorder=disorder, **settings))
+    scene = tc.Scene(n_particles=128, n_bands=B, realizations=60, disorder=disorder, **settings)
+    return tc.band_transfer(scene, starts=False)
 
 
 @pytest.fixture(scope="module")

@@ -183,7 +183,7 @@ def test_strong_disorder_of_other_kinds(kind, strength):
     times = np.concatenate([np.arange(0, 4, 0.5), np.arange(4, 41, 3)])
     disorder = tc.Disorder(kind, strength)
     scene = tc.Scene(n_particles=48, n_bands=6, realizations=80, disorder=disorder, times=times)
-    own, fresh = (tc.band_transfer(replace(scene, seed=seed), method="modes") for seed in (0, 1))
+    own, fresh = (tc.band_transfer(replace(scene, seed=seed), method="modes", starts=False) for seed in (0, 1))
     master = tc.calibrate(own, bootstrap=8)
     assert "compact" in [rung.model for rung in master.calibration.report.selection.tried]
     assert master.calibration.report.certificate.holds
@@ -202,9 +202,9 @@ def test_listed_times_choose_as_well_as_times_by_logarithm():
     scene = tc.Scene(n_particles=48, n_bands=6, realizations=40)
     spaced = [torch.linspace(0, 500, 501), torch.cat([torch.zeros(1), torch.logspace(-1, math.log10(500), 60)])]
     seen = torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 500.0], dtype=torch.float64)
-    fresh = tc.band_transfer(replace(scene, seed=1, realizations=100, times=seen), method="modes")
+    fresh = tc.band_transfer(replace(scene, seed=1, realizations=100, times=seen), method="modes", starts=False)
     for times in spaced:
-        own = tc.band_transfer(replace(scene, times=times), method="modes")
+        own = tc.band_transfer(replace(scene, times=times), method="modes", starts=False)
         off = tc.total_variation(tc.calibrate(own, bootstrap=0).model.transfer(seen), fresh.mean).mean(0)
         ensembles = tc.statistical_distance(fresh.stderr).mean(0) * math.sqrt((1 + 100 / 40) / 2)  # of 40 and of 100 chains
         assert all(float(off[part].mean()) < 1.5 * float(ensembles[part].mean()) for part in (seen <= 8, seen > 8))
@@ -213,7 +213,7 @@ def test_listed_times_choose_as_well_as_times_by_logarithm():
 def test_coarse_times_are_no_reason_to_refuse():
     """The slopes in a window are a comparison for models without rates, and needed by those with rates alone."""
     scene = tc.Scene(n_particles=64, n_bands=8, realizations=20, times=[0.0, 5.0, 10.0, 20.0, 40.0, 80.0])
-    transfer = tc.band_transfer(scene, method="modes")
+    transfer = tc.band_transfer(scene, method="modes", starts=False)
     for settings in ({}, {"model": "compact"}, {"model": "memory", "order": (1, 1)}):
         master = tc.calibrate(transfer, bootstrap=0, **settings)
         assert master.calibration.window == (0.0, 5.0)
@@ -563,7 +563,7 @@ def test_between_members_prediction_is_near_the_chains(family):
         disorder=tc.Disorder(strength=0.25),
         seed=9,
     )
-    chains = tc.band_transfer(scene)
+    chains = tc.band_transfer(scene, starts=False)
     distance = tc.total_variation(family.at(0.25).model.transfer(chains.times), chains.mean).mean()
     wrong = tc.total_variation(family.at(0.1).model.transfer(chains.times), chains.mean).mean()
     assert float(distance) < 0.03 < float(wrong) / 2
