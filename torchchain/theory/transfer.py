@@ -36,6 +36,7 @@ _MOST_TONES = 1024  # of the ring on which interference is added up: beyond it b
 _SLACK = 2e-4  # least share of definition "site", as in ensembles
 _SHAPE_ERROR = 0.2  # part of the interference that its universal shape misses, measured
 _ONSET_ERROR = 0.6  # part of a factor of two in its time of onset, likewise
+_ROUNDING = 1e-9  # share of the energy below which what has been scattered is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +221,8 @@ def _exchange(mean: Tensor, band: int, held: Tensor, exact: Tensor) -> None:
     """Give the mean wave (time,) in its band its exact energy, at the cost of what has been scattered, (time, band)."""
     mean[:, band] -= held
     scattered = mean.sum(-1)
-    change = torch.minimum(exact - held, scattered.clamp(min=0))
-    mean *= (1 - change / scattered.clamp(min=1e-300))[:, None]
+    change = torch.minimum(exact - held, scattered) * (scattered > _ROUNDING)  # before anything is scattered there is no cost
+    mean *= (1 - change / scattered.clamp(min=_ROUNDING))[:, None]
     mean[:, band] += held + change
 
 
