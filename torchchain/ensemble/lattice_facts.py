@@ -10,7 +10,6 @@ import torch
 from torchchain.ensemble.observables import chosen_observables
 from torchchain.ensemble.scene import Scene
 from torchchain.evolvers.expansion import LEAP, LONGEST, SHARED_PHASE, terms
-from torchchain.network import damped, modes
 
 EPS = 2.0**-53
 SPREAD = 1.1  # the highest frequency of all lattices over that of the first
@@ -66,8 +65,7 @@ class LatticeFacts:
         rounding = EPS * (2000 + 40 * self.top * self.end)
         if method == "verlet":
             return self._step_error() * options["step"] ** 2 + rounding
-        most = {"modes": modes.MOST_UNKNOWNS, "damped": damped.MOST_UNKNOWNS}.get(method, math.inf)
-        return math.inf if self.n > most else 5 * options.get("accuracy", 0.0) + rounding
+        return math.inf if self.n > self.scene.methods[method].most_unknowns else 5 * options.get("accuracy", 0.0) + rounding
 
     def _step_error(self) -> float:
         """Verlet's phase errors w^3 step^2 t / 24 at the highest frequency, in the energies twice that."""

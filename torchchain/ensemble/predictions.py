@@ -235,7 +235,6 @@ PASS = 2.6e-10  # an elementwise pass, per number
 FLOP = 2.1e-11  # of a product of matrices
 TRIG = 3.0e-9  # a cosine
 DRAW = 2.6e-8  # a particle
-DECOMPOSITION = {"modes": (6.0e-8, 1.6e-10), "tridiagonal": (6.3e-8, 2e-11), "damped": (9.3e-7, 1.4e-8)}  # per N^2, N^3
 STENCIL, SUM, MOMENT, TRANSFORM, BESSEL, START = (
     2.2e-10,
     1.2e-10,
@@ -264,13 +263,13 @@ def cost(method: str, facts: Facts | LatticeFacts, options: dict[str, Any], dtyp
     else:
         seconds = _decomposed(entry, facts)
     if any(not observable.in_time for observable in facts.observables):
-        seconds += 4 * facts.rows * n**2 * PASS + (_decomposition("modes", n) if method != "modes" else 0.0)
+        seconds += 4 * facts.rows * n**2 * PASS + (_decomposition(METHODS["modes"], n) if method != "modes" else 0.0)
     calls = CALLS + 40 * len(facts.observables) + 300 * (facts.part is not None)
     return seconds + facts.scene.n_particles * DRAW + (calls / chunk + 100) * CALL
 
 
-def _decomposition(method: str, n: int) -> float:
-    square, cube = DECOMPOSITION.get(method, DECOMPOSITION["modes"])
+def _decomposition(entry: Method, n: int) -> float:
+    square, cube = entry.decomposition
     return square * n**2 + cube * n**3
 
 
@@ -285,7 +284,7 @@ def _observing(facts: Facts) -> float:
 def _decomposed(entry: Method, facts: Facts) -> float:
     n, count = facts.n, len(facts.gaps)
     states = facts.rows * count * n
-    seconds = _decomposition(entry.name, n) + 2 * count * n * TRIG
+    seconds = _decomposition(entry, n) + 2 * count * n * TRIG
     if entry.damped:
         return seconds + states * (20 * n * FLOP + 6 * TRIG + 20 * PASS) + _observing(facts)
     if entry.name == "modes" and facts.bands_alone and facts.scene.energy_definition == "site":

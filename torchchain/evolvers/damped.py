@@ -175,4 +175,5 @@ METHOD = Method(
     damped=True,
     candidate=True,
     matrices=48,
+    decomposition=(9.3e-7, 1.4e-8),
 )

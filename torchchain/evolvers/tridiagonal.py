@@ -50,4 +50,5 @@ METHOD = Method(
     boundaries=("fixed",),
     candidate=True,
     matrices=8,
+    decomposition=(6.3e-8, 2e-11),
 )

@@ -65,4 +65,5 @@ METHOD = Method(
     damped=True,
     candidate=True,
     matrices=24,
+    most_unknowns=MOST_UNKNOWNS,
 )

@@ -12,7 +12,7 @@ from torchchain.chain import State
 from torchchain.evolvers.method import Advance
 from torchchain.evolvers.modes import METHOD as CHAINS
 from torchchain.modes import phase
-from torchchain.network.modes import NetworkModes, normal_modes
+from torchchain.network.modes import MOST_UNKNOWNS, NetworkModes, normal_modes
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import NetworkTrajectory
 
@@ -65,5 +65,6 @@ METHOD = replace(
     cost="(n c)^3 once for n particles of c components, (n c)^2 per output time; (n c)^2 memory",
     cannot="damping, contacts that open, more than some thousand unknowns",
     matrices=12,
+    most_unknowns=MOST_UNKNOWNS,
     options={"modes": "NetworkModes of the network, where they are at hand"},
 )
