@@ -80,19 +80,21 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(1, len(config.strengths))
-    for ax, xi in zip(np.atleast_1d(axes).ravel(), config.strengths, strict=True):
+    figure, axes = harness.panels(1, len(config.strengths), height=3.0)
+    lowest, highest = 0.8 * float(data.noise.min()), 1.2 * float(data.error.max())
+    for ax, xi in zip(axes[0], config.strengths, strict=True):
         part = data.sel(strength=xi)
         for name, style in STYLES.items():
             chosen = [j for j, (model, _) in enumerate(RUNGS) if model == name]
             at = np.maximum(part.numbers.values[chosen], 1)  # the theory's none at the left edge
             ax.plot(at, part.error.values[chosen], style + "-", ms=12 if name == "theory" else 5, lw=0.8,
-                    label=f"{name}, none" if name == "theory" else name)  # fmt: skip
-        ax.axhline(float(part.noise[0]), color="gray", ls=":", label=f"ensemble of {config.realizations} chains itself")
+                    label=f"{name}, no number" if name == "theory" else name)  # fmt: skip
+        ax.axhline(float(part.noise[0]), color="gray", ls=":", label=f"{config.realizations} chains themselves")
         ax.axhline(float(part.noise[1]), color="k", ls="--", lw=0.8, label=f"noise of {config.fresh} chains")
-        ax.set(xscale="log", yscale="log", xlabel="fitted numbers", ylabel=f"total variation from {config.fresh} fresh chains",
-               title=f"$\\xi$ = {xi:g}: calibrated on {config.realizations} chains")  # fmt: skip
-        ax.legend(fontsize=7)
+        ax.set(xscale="log", yscale="log", ylim=(lowest, highest), xlabel="fitted numbers", title=f"$\\xi$ = {xi:g}")
+        ax.label_outer()
+    axes[0, 0].set_ylabel("total variation")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=7)
     return figure
 
 

@@ -39,6 +39,7 @@ LAST = 800.0
 _EARLY, _ENOUGH = 40.0, 60.0  # end of the first stretch of times, and of what its grid could reach
 _DECAY, _LATE_DECAY = 6.0, 4.0  # eta times period: of the next period's, against what exp(eta t) makes of errors
 _SMOOTH, _LATE_SMOOTH = 0.8, 0.225  # widths of the windows at the spectrum's end
+_BEYOND = 0.4  # above the edge of the spectrum by this, the medium is exact enough
 _ORDERS, _EARLY_ORDERS = 32, 24
 _OVERSAMPLED, _RADIUS = 3, 0.9  # nodes an order, on a circle of this radius, for Taylor coefficients
 _FAR = 2.3  # from here on |2 - z^2 m| is far from resonance
@@ -108,7 +109,9 @@ def mean_wave_energy(law: Law, waves: Waves, times: Tensor) -> tuple[Tensor, Ten
     for start, stop in ((0.0, _EARLY), (_EARLY, min(LAST, float(times[-1])))):
         inside = (times > start) & (times <= stop)
         if bool(inside.any()):
-            found = _energies(law, waves, times[inside], _stretch(start, float(times[inside][-1]), edge))
+            found = _energies(
+                law, waves, times[inside], _stretch(start, float(times[inside][-1]), edge), edge + _BEYOND
+            )
             medium[:, inside], exact[:, inside] = found
     gone = (2 * times / LAST - 1).clamp(0, 1)
     medium[:, times > LAST] = exact[:, times > LAST] = 0
@@ -122,15 +125,18 @@ def _stretch(start: float, stop: float, edge: float) -> Stretch:
     return Stretch(start, stop, decay / period, step, cut, smooth, math.ceil((cut + 4 * smooth) / step))
 
 
-def _energies(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> tuple[Tensor, Tensor]:
+def _energies(law: Law, waves: Waves, times: Tensor, stretch: Stretch, highest: float) -> tuple[Tensor, Tensor]:
     z, loss, inner = line(waves, stretch)
     mass, _ = coherent_mass(inner, law, waves.ring)
     ring = 1 / (waves.sources[:, None] - inner.square() * mass)
-    exact, medium = mean_resolvent(inner, law, waves.wavenumbers, _ORDERS if stretch.start > 0 else _EARLY_ORDERS)
+    below = int((z.real < highest).sum())
+    orders = _ORDERS if stretch.start > 0 else _EARLY_ORDERS
+    exact, medium = mean_resolvent(inner[:below], law, waves.wavenumbers, orders)
+    change = torch.nn.functional.pad(exact - medium, (0, len(z) - below))
     whole, loss = mirrored(z, -1), mirrored(loss)
     window = window_of(whole, stretch)
     found = [
         coherent_energy(law, waves, times, stretch, whole, mirrored(mean) / loss, loss, window)
-        for mean in (ring, ring + exact - medium)
+        for mean in (ring, ring + change)
     ]
     return found[0], found[1]
