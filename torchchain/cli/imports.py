@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import re
 import time
 import warnings
@@ -26,6 +25,7 @@ from torchchain.ensemble.provenance import Provenance
 from torchchain.ensemble.stages import Stages
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.frames import ContactUnits, Frames, FramesWarning, check_opening, convert, read_frames
+from torchchain.frames.opening import matching
 from torchchain.frames.order import line_axis
 from torchchain.frames.units import LAWS
 from torchchain.network import Network
@@ -152,10 +152,9 @@ def files_of(flags: Import) -> list[RunFiles]:
         raise checks.fail("runs", "be at least one file or pattern", "none")
     paths: list[Path] = []
     for word in flags.runs:
-        found = [word] if not glob.has_magic(word) or Path(word).exists() else sorted(glob.glob(word), key=_by_number)
-        if not found or not word:
+        if not word:
             raise checks.fail("runs", "match at least one file", repr(word))
-        paths += map(Path, found)
+        paths += map(Path, matching("runs", word))
     for path in paths:
         if not path.is_file():
             raise checks.fail("runs", "be files", "a folder" if path.is_dir() else f"no file {path}")
@@ -179,10 +178,6 @@ def files_of(flags: Import) -> list[RunFiles]:
         RunFiles(path.absolute(), found if found is None else found.absolute(), contacts[path])
         for path, found in ((path, references[path]) for path in runs)
     ]
-
-
-def _by_number(name: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _reference(template: str | None, run: Path) -> Path | None:

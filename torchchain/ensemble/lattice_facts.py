@@ -65,7 +65,11 @@ class LatticeFacts:
         rounding = EPS * (2000 + 40 * self.top * self.end)
         if method == "verlet":
             return self._step_error() * options["step"] ** 2 + rounding
-        return math.inf if self.n > self.scene.methods[method].most_unknowns else 5 * options.get("accuracy", 0.0) + rounding
+        return (
+            math.inf
+            if self.n > self.scene.methods[method].most_unknowns
+            else 5 * options.get("accuracy", 0.0) + rounding
+        )
 
     def _step_error(self) -> float:
         """Verlet's phase errors w^3 step^2 t / 24 at the highest frequency, in the energies twice that."""

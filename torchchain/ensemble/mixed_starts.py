@@ -79,7 +79,9 @@ def fit_transfer(starts: Tensor, energies: Tensor, realization: Tensor) -> Fitte
 def _jackknife(mean: Tensor, replicates: Tensor, counts: tuple[int, ...], condition: float) -> FittedTransfer:
     """The transfer with the error and the pseudo-values of those without one block each."""
     blocks = len(counts)
-    return FittedTransfer(mean, jackknife_error(replicates), blocks * mean - (blocks - 1) * replicates, counts, condition)
+    return FittedTransfer(
+        mean, jackknife_error(replicates), blocks * mean - (blocks - 1) * replicates, counts, condition
+    )
 
 
 def _check_left(starts: Tensor, kept: Tensor, realization: Tensor) -> None:

@@ -139,15 +139,16 @@ def check_same(at: str, frame: Frame, first: Frame) -> None:
         )
     if frame.axes != first.axes or frame.unwrapped != first.unwrapped:
         raise checks.fail(f"{at}: positions", "be as in the first frame", ", ".join(frame.axes))
+    check_properties(at, frame, first, "stay as in the first frame (have particles come or gone?)")
+
+
+def check_properties(at: str, frame: Frame, other: Frame, rule: str) -> None:
+    """An error for masses or radii, where both frames have them, that differ from those of another frame."""
     for name in ("masses", "radii"):
-        a, b = getattr(frame, name), getattr(first, name)
+        a, b = getattr(frame, name), getattr(other, name)
         if a is not None and b is not None and not torch.equal(a, b):
             bad = int((a != b).nonzero()[0])
-            raise checks.fail(
-                f"{at}: {name}",
-                "stay as in the first frame (have particles come or gone?)",
-                f"{a[bad]:g} after {b[bad]:g} of id {int(first.ids[bad])}",
-            )
+            raise checks.fail(f"{at}: {name}", rule, f"{a[bad]:g} against {b[bad]:g} of id {int(other.ids[bad])}")
 
 
 def masses_of(at: str, frame: Frame, types: np.ndarray | None, file: File, options: dict[str, Any]) -> dict[str, Any]:

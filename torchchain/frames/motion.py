@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.states import Trajectory
+from torchchain.frames.building import check_properties
 from torchchain.frames.doubts import check_across, check_bounds, check_digits, here, warn
 from torchchain.frames.order import check_contact_order, line_axis, line_order
 from torchchain.frames.record import AXES, TIMED, Box, Frame
@@ -106,15 +107,7 @@ def _check_alike(name: str, first: Frame, reference: Frame, reference_name: str)
             if len(reference.ids) != len(first.ids)
             else "others",
         )
-    for field in ("masses", "radii"):
-        a, b = getattr(reference, field), getattr(first, field)
-        if a is not None and b is not None and not torch.equal(a, b):
-            bad = int((a != b).nonzero()[0])
-            raise checks.fail(
-                f"{where}: {field}",
-                f"be those of {name}",
-                f"{a[bad]:g} against {b[bad]:g} for id {int(first.ids[bad])}",
-            )
+    check_properties(where, reference, first, f"be those of {name}")
 
 
 def _check_box(name: str, frame: Frame, reference: Frame, axis: str) -> None:

@@ -83,19 +83,20 @@ def _check_options(options: dict[str, Any]) -> dict[str, Any]:
     return options
 
 
+def matching(field: str, word: str) -> list[str]:
+    """The file of that name, or those that match the pattern, in the order of the numbers in their names."""
+    if os.path.exists(word) or not glob.has_magic(word):
+        return [word]
+    found = glob.glob(word)
+    if not found:
+        raise checks.fail(field, "match at least one file", repr(word))
+    return sorted(found, key=lambda name: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)])
+
+
 def _files(field: str, path: Source | Sequence[Source]) -> list[Path]:
     """The files of a path, a pattern, or a list; those of a pattern in the order of the numbers in their names."""
     if isinstance(path, (str, os.PathLike)):
-        text = os.fspath(path)
-        if isinstance(text, str) and not os.path.exists(text) and glob.has_magic(text):
-            found = sorted(
-                glob.glob(text),
-                key=lambda name: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)],
-            )
-            if not found:
-                raise checks.fail(field, "match at least one file", repr(text))
-            return [readable(field, Path(name)) for name in found]
-        return [readable(field, Path(os.fsdecode(text)))]
+        return [readable(field, Path(name)) for name in matching(field, os.fsdecode(path))]
     if not isinstance(path, Sequence) or not path:
         raise checks.FieldTypeError(f"{field} must be a path, a pattern or a list of paths, got {checks.shown(path)}")
     return [file for part in path for file in _files(field, part)]
