@@ -52,9 +52,9 @@ def candidates(config: Config) -> list[tuple[str, str, str, dict[str, Any]]]:
 
 
 def measure(config: Config, device: str) -> xarray.Dataset:
-    began = time.perf_counter()
+    began = time.process_time()
     own = tc.band_transfer(config.scene(config.strength), device=device)
-    ensemble_seconds = time.perf_counter() - began
+    ensemble_seconds = time.process_time() - began
     fresh = tc.band_transfer(replace(config, seed=config.fresh_seed).scene(config.strength), device=device)
     later = own.times > 0
     tc.calibrate(own, "analytic", "paper")  # the first call pays for loading libraries
@@ -72,11 +72,11 @@ def _judge(
     ensemble_seconds: float,
 ) -> dict[str, Any]:  # fmt: skip
     label, method, model, settings = candidate
-    began = time.perf_counter()
+    began = time.process_time()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", FitWarning)
         master = tc.calibrate(own, method, model, **settings)
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     later = own.times > 0
     predicted = master.model.transfer(own.times).detach()
     late = master.model.transfer(torch.tensor([config.horizon], dtype=torch.float64)).detach().sum(-1) - 1
@@ -149,7 +149,7 @@ def _costs(ax: Axes, data: xarray.Dataset) -> None:
     ]
     handles += [ax.plot([], [], color=color, linewidth=5, label=name)[0] for name, color in colors.items()]
     ax.legend(handles=handles, fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
-    ax.set(xlabel="seconds of the fit / seconds of the ensemble", ylabel="total variation from fresh chains",
+    ax.set(xlabel="processor time of the fit / of the ensemble", ylabel="total variation from fresh chains",
            xscale="log", yscale="log", title="(b) error and cost")  # fmt: skip
     for label in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
         label("{x:g}")
@@ -178,7 +178,7 @@ def _gradients(ax: Axes, data: xarray.Dataset) -> None:
         ax.plot([], [], marker, color="0.4", linestyle="none", label=tool)[0] for tool, marker in tools.items()
     ]
     ax.legend(handles=handles, fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
-    ax.set(xlabel="seconds of the fit", ylabel="error / that of two ensembles", xscale="log", yscale="log", title="(c) gradients")
+    ax.set(xlabel="processor seconds of the fit", ylabel="error / that of two ensembles", xscale="log", yscale="log", title="(c) gradients")
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("{x:g}")
 
@@ -212,7 +212,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
     lines = [
         f"measured: total variation from {config.realizations} fresh chains, mean over sources and 0 < t <= {config.stop:g}; "
         "own: from the chains of the fit;\nenergy - 1: of the source that is furthest off; "
-        f"cost: seconds over the {data.ensemble_seconds:.1f} s of the ensemble.",
+        f"cost: processor time over the {data.ensemble_seconds:.1f} s of the ensemble.",
         f"Nearest to fresh chains: {names[best]}, {float(data.fresh[best]):.4f} where two ensembles differ by {data.noise:.4f}.",
         "What stays behind matters more than how Q is fitted. Best of every model: "
         + ", ".join(f"{model} {float(part.min()):.4f}" for model, part in data.fresh.groupby(data.model))

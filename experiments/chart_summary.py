@@ -20,7 +20,7 @@ from harness import Row
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchchain import checks
+from torchchain import checks, plots
 
 CHARTS: tuple[ModuleType, ...] = (chart_evolvers, chart_solvers, chart_models, chart_ensemble)
 
@@ -177,10 +177,10 @@ def markdown(data: xarray.Dataset, config: Config) -> str:
 
 
 def draw(data: xarray.Dataset, config: Config) -> Figure:
-    figure, axes = harness.panels(2, 2, width=5.8, height=4.6)
+    figure, axes = harness.panels(2, 2, width=5.8, height=5.0)
     accuracy = config.accuracies[len(config.accuracies) // 2]
-    _dots(axes[0, 0], data, "evolver", accuracy, f"(a) one chain to error {accuracy:.0e}")
-    _dots(axes[0, 1], data, "solver", accuracy, f"(b) master equation to error {accuracy:.0e}")
+    _dots(axes[0, 0], data, "evolver", accuracy, f"(a) one chain, error {accuracy:.0e}")
+    _dots(axes[0, 1], data, "solver", accuracy, f"(b) rates, error {accuracy:.0e}")
     _model_panel(axes[1, 0], data)
     _way_panel(axes[1, 1], data)
     return figure
@@ -214,7 +214,7 @@ def _model_panel(ax: Axes, data: xarray.Dataset) -> None:
     for i, name in enumerate(dict.fromkeys(data.model_name.values)):
         part = data.isel(model=data.model_name.values == name)
         ax.plot(
-            part.model_bands, part.model_distance / part.model_noise, marker="os^vD*PX"[i % 8], color=f"C{i % 7}", label=name
+            part.model_bands, part.model_distance / part.model_noise, marker="os^vD*PX"[i % 8], color=(*plots.COLORS, "0.6")[i % 8], label=name
         )
     ax.axhline(1, color="k", linestyle=":", label="two ensembles of chains")
     bands = list(dict.fromkeys(data.model_bands.values))
@@ -231,7 +231,7 @@ def _way_panel(ax: Axes, data: xarray.Dataset) -> None:
     ax.barh(order + 0.2, data.way_work, 0.35, color="C0", label="chains evolved")
     ax.barh(order - 0.2, data.way_seconds, 0.35, color="C1", hatch="///", label="seconds")
     names = [
-        f"{o.partition(':')[0]}:\n{n}" for o, n in zip(data.way_observable.values, data.way_name.values, strict=True)
+        f"{o.partition(':')[0]}: {n}".replace(": ", ":\n").replace(", ", ",\n") for o, n in zip(data.way_observable.values, data.way_name.values, strict=True)
     ]
     ax.set_yticks(order, names, fontsize="small")
     ax.axvline(1, color="k", linewidth=0.8)
