@@ -218,11 +218,13 @@ def crossed_part(ladder: Tensor, crossed: Tensor, first: Tensor, numbers: Return
 
 
 def _exchange(mean: Tensor, band: int, held: Tensor, exact: Tensor) -> None:
-    """Give the mean wave (time,) in its band its exact energy, at the cost of what has been scattered, (time, band)."""
+    """Give the mean wave (time,) in its band its exact energy, at the cost of bands in proportion to what has been scattered
+    into them, (time, band), and never more than that."""
     mean[:, band] -= held
-    scattered = mean.sum(-1)
-    change = torch.minimum(exact - held, scattered) * (scattered > _ROUNDING)  # before anything is scattered there is no cost
-    mean *= (1 - change / scattered.clamp(min=_ROUNDING))[:, None]
+    scattered = mean.clamp(min=0)
+    there = scattered.sum(-1)
+    change = torch.minimum(exact - held, there) * (there > 0)
+    mean -= (change / there.clamp(min=1e-300))[:, None] * scattered
     mean[:, band] += held + change
 
 
