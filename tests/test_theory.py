@@ -236,7 +236,7 @@ def test_clusters_of_light_particles_beat():
     assert float((theory - excess)[5:7, 0].abs().max()) < 0.02
     torch.testing.assert_close(result.mean.sum(-1), torch.ones(8, 4, dtype=torch.float64), rtol=0, atol=1e-9)
     # Long waves, where hardly anything has been scattered: what the mean wave takes leaves no band below zero.
-    assert float(theory_transfer(disorder, 256, 32, [8.0], tones=[2]).mean.min()) > -2e-4
+    assert float(theory_transfer(disorder, 256, 32, [8.0], tones=[2]).mean.min()) > -5e-4
 
 
 def test_localization_is_what_the_ladder_lacks_at_late_times(chains):
