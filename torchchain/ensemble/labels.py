@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchchain import checks
 from torchchain._version import __version__
 from torchchain.chain.scaling import Scaling
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import Moments
 from torchchain.network.random_lattices import RandomLattices
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def tensor_of(data: xarray.Dataset, name: str) -> Tensor:
+    """A variable of float32 or float64, as it is.
+
+    Raises:
+        FieldError, FieldTypeError: for one that is missing or of another kind.
+    """
+    if name not in data:
+        raise checks.fail("data", f"hold the variable {name}", ", ".join(map(str, data)))
+    values = np.array(data[name].values)
+    if values.dtype not in (np.float32, np.float64):
+        raise checks.FieldTypeError(f"data.{name} must be of float32 or float64, got {values.dtype}")
+    return torch.from_numpy(values)
 
 
 def ordered_error(is_ordered: bool, moment: Moments) -> Tensor:

@@ -20,7 +20,7 @@ from torchchain import checks
 from torchchain.chain.excitation import StandingWave
 from torchchain.ensemble.block_means import QUIET
 from torchchain.ensemble.checkpoint import Checkpoint
-from torchchain.ensemble.labels import ordered_error
+from torchchain.ensemble.labels import ordered_error, tensor_of
 from torchchain.ensemble.run import ensemble_moments
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import merged
@@ -107,20 +107,13 @@ class StartTransfer:
         if "start_tone" not in data:
             return None
 
-        def tensor(name: str) -> Tensor:
-            if name not in data:
-                raise checks.fail("data", f"hold the variable {name} beside its start_tone", ", ".join(map(str, data)))
-            values = np.array(data[name].values)
-            if values.dtype not in (np.float32, np.float64):
-                raise checks.FieldTypeError(f"data.{name} must be of float32 or float64, got {values.dtype}")
-            return torch.from_numpy(values.astype(np.float64))
-
         tones = tuple(checks.integer("data.start_tone", tone, 1) for tone in np.atleast_1d(data["start_tone"].values))
         names = ("released", "released_stderr", "kicked", "kicked_stderr")
         samples = checks.integer(
             "data.start_samples", data["start_samples"].values.tolist() if "start_samples" in data else 0, 1
         )
-        return cls(tones, tensor("start_time"), samples=samples, **{name: tensor(name) for name in names})
+        times, *found = (tensor_of(data, name).double() for name in ("start_time", *names))
+        return cls(tones, times, samples=samples, **dict(zip(names, found, strict=True)))
 
 
 def start_tones(scene: Scene) -> tuple[int, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain._version import __version__
 from torchchain.ensemble.block_means import decoded, encoded
-from torchchain.ensemble.labels import scene_attributes, time_coordinates
+from torchchain.ensemble.labels import scene_attributes, tensor_of, time_coordinates
 from torchchain.ensemble.provenance import Provenance
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.starts import StartTransfer
@@ -95,12 +96,7 @@ def fields_of(data: xarray.Dataset) -> dict[str, Any]:
     else:
         attributes |= {name: checks.number(f"data.{name}", data.attrs[name]) for name in OF_RUNS if name in data.attrs}
 
-    def tensor(name: str) -> Tensor:
-        values = np.array(data[name].values)
-        if values.dtype not in (np.float32, np.float64):
-            raise checks.FieldTypeError(f"data.{name} must be of float32 or float64, got {values.dtype}")
-        return torch.from_numpy(values)
-
+    tensor = partial(tensor_of, data)
     held = "long_time" in data
     mean, stderr = tensor("band_energy"), tensor("band_energy_stderr")
     counts = tuple(checks.integer("data.block_count", n, 1) for n in np.atleast_1d(data["block_count"].values))

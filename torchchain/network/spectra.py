@@ -24,6 +24,7 @@ from torchchain.network.layouts import layout_of
 from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network
 from torchchain.network.plane_waves import plane_wave
+from torchchain.network.wavenumber import POLARIZATIONS, polarizations
 
 _STARTS = 5  # the random stream of the starts
 
@@ -224,14 +225,12 @@ def structure_factor(
                         raise
                     waves.append(plane_wave(network, turns, polarization, 1.0, "cos").displacement)
     else:
-        from torchchain.network.wavenumber import POLARIZATIONS, _frame
-
         scalar = network.n_components == 1
         checks.choice("polarization", polarization, ("scalar",) if scalar else POLARIZATIONS)
         for q in checks.real_tensor("wavevectors", wavevectors).to(network.positions):
             if not bool(q.any()):
                 raise checks.fail("wavevectors", "not be zero", q.tolist())
-            frame = _frame(q, network.dimension)
+            frame = polarizations(q, network.dimension)
             direction = torch.ones(1).to(q) if scalar else frame[0 if polarization == "longitudinal" else 1]
             phase = network.positions @ q
             waves += [phase.sin()[:, None] * direction, phase.cos()[:, None] * direction]

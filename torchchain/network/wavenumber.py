@@ -211,7 +211,7 @@ def plane_waves(network: Network, wavevectors: Tensor) -> tuple[Tensor, Tensor, 
     phase = x @ wavevectors.mT
     columns, number, kind = [], [], []
     for k, q in enumerate(wavevectors):
-        frame = _frame(q, d) if c > 1 else torch.ones(1, 1).to(q)
+        frame = polarizations(q, d) if c > 1 else torch.ones(1, 1).to(q)
         rest = not bool(q.any())
         for wave in [torch.ones_like(phase[:, k])] if rest else [phase[:, k].cos(), phase[:, k].sin()]:
             for e, direction in enumerate(frame):
@@ -231,7 +231,7 @@ def plane_waves(network: Network, wavevectors: Tensor) -> tuple[Tensor, Tensor, 
     return basis, torch.tensor(number, device=device), torch.tensor(kind, device=device)
 
 
-def _frame(q: Tensor, d: int) -> Tensor:
+def polarizations(q: Tensor, d: int) -> Tensor:
     """Orthonormal directions, the first along q, as rows."""
     if not bool(q.any()):
         return torch.eye(d).to(q)
