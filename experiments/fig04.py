@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import harness
 import numpy as np
@@ -14,6 +15,7 @@ import torch
 import xarray
 from fig02 import Kick, each_realization, mean_and_error
 from harness import Row
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -150,6 +152,20 @@ def measure(config: Config, device: str) -> xarray.Dataset:
     )
 
 
+def exponents(ax: Axes, x: np.ndarray, fits: Sequence[Any], xlabel: str) -> Axes:
+    """Exponents of power laws with error bars, and the slopes in both halves of each one's window.
+
+    Each fit has ``exponent``, ``stderr``, ``lower`` and ``upper``.
+    """
+    ax.errorbar(
+        x, [fit.exponent for fit in fits], [fit.stderr for fit in fits], fmt="ko-", capsize=3, label="whole window"
+    )
+    ax.plot(x, [fit.lower for fit in fits], "v", color="C0", mfc="none", label="lower half")
+    ax.plot(x, [fit.upper for fit in fits], "^", color="C3", mfc="none", label="upper half")
+    ax.set(xlabel=xlabel, ylabel="exponent")
+    return ax
+
+
 def draw(data: xarray.Dataset, config: Config) -> Figure:
     figure, axes = harness.panels(1, 2, width=5.6, height=4.4)
     left, right = axes[0]
@@ -164,7 +180,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     left.plot([], [], "k--", lw=0.8, label="power laws")
     left.set(xlabel="particle $p$", ylabel="mean energy / energy of kick", xscale="log", yscale="log")
     left.legend(fontsize="small")
-    plots.exponents(right, np.array(config.strengths), fits, "disorder $\\xi$")
+    exponents(right, np.array(config.strengths), fits, "disorder $\\xi$")
     right.axhline(-2.5, color="k", lw=0.8, ls=":", label="infinite chain, infinite time: $-5/2$")
     right.legend(fontsize="small")
     figure.suptitle(

@@ -8,6 +8,7 @@ import io
 import math
 import shlex
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -238,12 +239,56 @@ def _table(rows: list[Row]) -> dict[str, Any]:
     }
 
 
+CHARACTER = 0.062
+"""Width of a character of eight points, in inches, on average."""
+
+
+def legends_below(figure: Any, columns: int = 2) -> None:
+    """Every legend that lies on data comes below its axes, and the figure grows by what that takes."""
+    rows: dict[int, int] = {}
+    for ax in figure.axes:
+        found = ax.get_legend()
+        if found is None or found.get_bbox_to_anchor() is not ax.bbox:
+            continue
+        labels = [text.get_text() for text in found.get_texts()]
+        widest = max(map(len, labels))
+        across = 1 if widest > 24 else columns if widest > 10 else columns + 1
+        title = found.get_title().get_text()
+        plots.legend(
+            ax,
+            across,
+            handles=found.legend_handles,
+            labels=labels,
+            **({"title": title, "title_fontsize": 7} if title else {}),
+        )
+        where = ax.get_subplotspec()
+        row = 0 if where is None else where.rowspan.start
+        rows[row] = max(rows.get(row, 0), -(-len(labels) // across) + bool(title))
+    figure.set_figheight(figure.get_figheight() + 0.14 * sum(rows.values()))
+
+
+def wrapped_labels(figure: Any) -> None:
+    """Titles and labels of vertical axes that are longer than their panel, on several lines; formulas are not broken."""
+    for ax in figure.axes:
+        where = ax.get_subplotspec()
+        if where is None:
+            continue
+        shape = where.get_gridspec()
+        for label, room in (
+            (ax.yaxis.label, 0.75 * figure.get_figheight() * len(where.rowspan) / shape.nrows),
+            (ax.title if ax.get_title() else ax._left_title, 0.95 * figure.get_figwidth() * len(where.colspan) / shape.ncols),
+        ):
+            text, most = label.get_text(), int(room / CHARACTER)
+            if len(text) > most and not set("$\n") & set(text):
+                label.set_text(textwrap.fill(text, most))
+
+
 def drawn(script: Script, data: xarray.Dataset, config: Any) -> Figure:
     """The figure in the sizes of print, legends off the data."""
     with plots.style():
         figure = script.draw(data, config)
-        plots.wrapped_labels(figure)
-        plots.legends_below(figure)
+        wrapped_labels(figure)
+        legends_below(figure)
         shown = [ax for ax in figure.axes if ax.get_subplotspec() is not None and ax.axison]  # no bars, no insets
         if len(shown) > 1 and not any("(a)" in ax.get_title(where) for ax in shown for where in ("left", "center")):
             plots.lettered(shown)

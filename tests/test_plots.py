@@ -88,16 +88,3 @@ def test_sources_to_show(asked, found):
 def test_sources_that_cannot_be_shown(asked):
     with pytest.raises(tc.FieldError, match="show must"):
         sources_of(asked, 32)
-
-
-def test_labels_longer_than_their_panel_are_on_several_lines():
-    figure, axes = plots.figure(plots.PAGE, 2.0, 1, 3)
-    words = "a label that is far too long for a panel of this height"
-    axes[0, 0].set(ylabel=words, title="short")
-    axes[0, 1].set(ylabel=r"$\sum_{r \neq s} Q_{sr}$ and words that go on and on", title=words * 2)
-    plots.wrapped_labels(figure)
-    assert "\n" in axes[0, 0].get_ylabel()
-    assert axes[0, 0].get_ylabel().split() == words.split()
-    assert axes[0, 0].get_title() == "short"
-    assert "\n" not in axes[0, 1].get_ylabel()  # formulas are not broken
-    assert "\n" in axes[0, 1].get_title()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -47,50 +46,6 @@ def lettered(axes: Iterable[Axes]) -> None:
         ax.set_title(f"({letter}) {ax.get_title('left')}".rstrip(), loc="left")
 
 
-def legends_below(figure: Any, columns: int = 2) -> None:
-    """Every legend that lies on data comes below its axes, and the figure grows by what that takes."""
-    rows: dict[int, int] = {}
-    for ax in figure.axes:
-        found = ax.get_legend()
-        if found is None or found.get_bbox_to_anchor() is not ax.bbox:
-            continue
-        labels = [text.get_text() for text in found.get_texts()]
-        widest = max(map(len, labels))
-        across = 1 if widest > 24 else columns if widest > 10 else columns + 1
-        title = found.get_title().get_text()
-        legend(
-            ax,
-            across,
-            handles=found.legend_handles,
-            labels=labels,
-            **({"title": title, "title_fontsize": 7} if title else {}),
-        )
-        where = ax.get_subplotspec()
-        row = 0 if where is None else where.rowspan.start
-        rows[row] = max(rows.get(row, 0), -(-len(labels) // across) + bool(title))
-    figure.set_figheight(figure.get_figheight() + 0.14 * sum(rows.values()))
-
-
-def wrapped_labels(figure: Any) -> None:
-    """Titles and labels of vertical axes that are longer than their panel, on several lines; formulas are not broken."""
-    for ax in figure.axes:
-        where = ax.get_subplotspec()
-        if where is None:
-            continue
-        shape = where.get_gridspec()
-        for label, room in (
-            (ax.yaxis.label, 0.75 * figure.get_figheight() * len(where.rowspan) / shape.nrows),
-            (ax.title if ax.get_title() else ax._left_title, 0.95 * figure.get_figwidth() * len(where.colspan) / shape.ncols),
-        ):
-            text, most = label.get_text(), int(room / CHARACTER)
-            if len(text) > most and not set("$\n") & set(text):
-                label.set_text(textwrap.fill(text, most))
-
-
-CHARACTER = 0.062
-"""Width of a character of eight points, in inches, on average."""
-
-
 def legend(ax: Axes, columns: int = 2, **where: Any) -> None:
     """A legend below the axes, off the data."""
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.3, ncols=columns, **where)
@@ -104,14 +59,7 @@ def _colorbar(ax: Axes, image: Any, label: str, extend: str) -> None:
 def band_map(ax: Axes, times: np.ndarray, energy: np.ndarray, title: str = "", floor: float = 1e-3) -> Axes:
     """Share of the energy over time and band (as Figs. 12 and 18), energy [time, band], logarithmic colors."""
     bands = np.arange(1, energy.shape[-1] + 1)
-    from matplotlib.colors import LogNorm
-
-    image = ax.pcolormesh(
-        times, bands, np.maximum(energy.T, floor), norm=LogNorm(floor, 1.0), shading="nearest", rasterized=True
-    )
-    _colorbar(ax, image, "share of energy", extend="min")
-    ax.set(xlabel=TIME_LABEL, ylabel=BAND_LABEL, title=title)
-    return ax
+    return log_map(ax, times, bands, energy, TIME_LABEL, BAND_LABEL, "share of energy", title, floor)
 
 
 def field_map(
@@ -141,7 +89,7 @@ def log_map(
     image = ax.pcolormesh(
         x, y, np.maximum(values.T, floor), norm=LogNorm(floor, top), shading="nearest", rasterized=True
     )
-    _colorbar(ax, image, label, extend="both" if values.max() > top else "min")
+    _colorbar(ax, image, label, extend="both" if values.max() > top * (1 + 1e-9) else "min")
     ax.set(xlabel=xlabel, ylabel=ylabel, title=title)
     return ax
 
@@ -292,20 +240,6 @@ def implied_timescales(ax: Axes, lags: np.ndarray, timescales: np.ndarray, stder
         )
     ax.fill_between(lags, lags, 0, color="0.9", linewidth=0)
     ax.set(xlabel=r"lag $\tau$", ylabel=r"implied timescale $-\tau / \log|\lambda|$", yscale="log")
-    return ax
-
-
-def exponents(ax: Axes, x: np.ndarray, fits: Sequence[Any], xlabel: str) -> Axes:
-    """Exponents of power laws with error bars, and the slopes in both halves of each one's window.
-
-    Each fit has ``exponent``, ``stderr``, ``lower`` and ``upper``.
-    """
-    ax.errorbar(
-        x, [fit.exponent for fit in fits], [fit.stderr for fit in fits], fmt="ko-", capsize=3, label="whole window"
-    )
-    ax.plot(x, [fit.lower for fit in fits], "v", color="C0", mfc="none", label="lower half")
-    ax.plot(x, [fit.upper for fit in fits], "^", color="C3", mfc="none", label="upper half")
-    ax.set(xlabel=xlabel, ylabel="exponent")
     return ax
 
 

@@ -56,6 +56,8 @@ def public_names() -> dict[str, Any]:
     top = importlib.import_module("torchchain")
     names = {name: getattr(top, name) for name in top._HOME if not inspect.ismodule(getattr(top, name))}
     names.pop("__version__", None)
+    own = {id(value) for name, value in names.items() if getattr(value, "__name__", "") == name}
+    names = {n: v for n, v in names.items() if id(v) not in own or v.__name__ == n}  # without earlier names
     known = {id(value) for value in names.values()}
     for room in ROOMS:
         module = importlib.import_module(f"torchchain.{room}")
