@@ -419,3 +419,11 @@ def test_a_chain_is_the_network_in_one_dimension(boundary):
     if boundary == "periodic":
         shares = (tc.band_energy(x, path, 6) for x, path in ((chain, one), (network, two)))
         torch.testing.assert_close(*shares, rtol=0, atol=1e-12)
+
+
+def test_kernels_are_found_again_by_other_processes():
+    """Numba keys what it keeps by what a function closes over: a compiled function there would have another key in every process."""
+    kernel = kernels.gathered(2, 1, False, True)
+    inside = [cell.cell_contents for cell in kernel.py_func.__closure__]
+    assert inside
+    assert not any(hasattr(value, "py_func") for value in inside)

@@ -65,48 +65,7 @@ def gathered(components: int, fields: int, signed: bool, prestressed: bool):
     columns, width = components * fields, _U(components * fields)
     slot, nothing, origin = _U(components), (0.0,) * columns, (0.0,) * components
 
-    @_kernel
-    def one(first, old, now, low, high, runs, starts, ends, weight, stiff, directions, across):
-        """One step on the runs low to high - 1."""
-        to, of = old.reshape(-1), now.reshape(-1)
-        for run in range(low, high):
-            s = _U(starts[runs[run]])
-            neighbors = _U(starts[runs[run] + 1]) - s
-            for p in range(_U(runs[run]), _U(runs[run + 1])):
-                at = width * p
-                x, force = nothing, nothing
-                for c in range(columns):
-                    x = tuple_setitem(x, c, of[at + _U(c)])
-                for _ in range(neighbors):
-                    q = _U(ends[s])
-                    if components == 1:
-                        for c in range(columns):
-                            force = tuple_setitem(force, c, force[c] + stiff[s] * (of[q + _U(c)] - x[c]))
-                        s += _U(1)
-                        continue
-                    n = origin
-                    for a in range(components):
-                        n = tuple_setitem(n, a, directions[slot * s + _U(a)])
-                    for r in range(0, columns, components):
-                        apart, pull = origin, 0.0
-                        for a in range(components):
-                            apart = tuple_setitem(apart, a, of[q + _U(r + a)] - x[r + a])
-                            pull += n[a] * apart[a]
-                        if signed:
-                            pull *= stiff[s]
-                        for a in range(components):
-                            force = tuple_setitem(force, r + a, force[r + a] + n[a] * pull)
-                        if prestressed:
-                            for a in range(components):
-                                force = tuple_setitem(force, r + a, force[r + a] + across[s] * apart[a])
-                    s += _U(1)
-                w = weight[p]
-                for c in range(columns):
-                    if first:
-                        to[at + _U(c)] = x[c] + 0.5 * w * force[c]
-                    else:
-                        to[at + _U(c)] = w * force[c] + (2.0 * x[c] - to[at + _U(c)])
-
+    # One function: Numba finds one that closes over another compiled function in no cache, and compiles it in every process.
     @_kernel
     def run(
         steps, last, begin, end, cells, sums, table, keep, depth, lag, tiles, runs, starts, ends, weight, stiff, directions, across
@@ -126,20 +85,44 @@ def gathered(components: int, fields: int, signed: bool, prestressed: bool):
                         for p in range(low, high):
                             for c in range(columns):
                                 keep[p - low, c] = old[p, c]
-                    one(
-                        k == 1,
-                        old,
-                        now,
-                        tiles[tile],
-                        tiles[tile + 1],
-                        runs,
-                        starts,
-                        ends,
-                        weight,
-                        stiff,
-                        directions,
-                        across,
-                    )
+                    to, of = old.reshape(-1), now.reshape(-1)
+                    for r in range(tiles[tile], tiles[tile + 1]):
+                        s = _U(starts[runs[r]])
+                        neighbors = _U(starts[runs[r] + 1]) - s
+                        for p in range(_U(runs[r]), _U(runs[r + 1])):
+                            at = width * p
+                            x, force = nothing, nothing
+                            for c in range(columns):
+                                x = tuple_setitem(x, c, of[at + _U(c)])
+                            for _ in range(neighbors):
+                                q = _U(ends[s])
+                                if components == 1:
+                                    for c in range(columns):
+                                        force = tuple_setitem(force, c, force[c] + stiff[s] * (of[q + _U(c)] - x[c]))
+                                    s += _U(1)
+                                    continue
+                                n = origin
+                                for a in range(components):
+                                    n = tuple_setitem(n, a, directions[slot * s + _U(a)])
+                                for f in range(0, columns, components):
+                                    apart, pull = origin, 0.0
+                                    for a in range(components):
+                                        apart = tuple_setitem(apart, a, of[q + _U(f + a)] - x[f + a])
+                                        pull += n[a] * apart[a]
+                                    if signed:
+                                        pull *= stiff[s]
+                                    for a in range(components):
+                                        force = tuple_setitem(force, f + a, force[f + a] + n[a] * pull)
+                                    if prestressed:
+                                        for a in range(components):
+                                            force = tuple_setitem(force, f + a, force[f + a] + across[s] * apart[a])
+                                s += _U(1)
+                            w = weight[p]
+                            for c in range(columns):
+                                if k == 1:
+                                    to[at + _U(c)] = x[c] + 0.5 * w * force[c]
+                                else:
+                                    to[at + _U(c)] = w * force[c] + (2.0 * x[c] - to[at + _U(c)])
                     if count:
                         _add(low, high, keep, old, now, fields, sums, _terms(k, count, table))
 
