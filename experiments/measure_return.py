@@ -179,7 +179,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     axes[0, 0].set(xlabel="narrowing", ylabel="mean total variation at infinite time", ylim=(0, None))
     axes[0, 0].legend(fontsize=8)
     axes[0, 1].set(xscale="log", xlabel=plots.TIME_LABEL, ylabel="share of the interference that has come",
-                   title="median over sources; symbols: chains, lines: theory")  # fmt: skip
+                   title="symbols: chains, lines: theory")  # fmt: skip
     axes[0, 1].legend(fontsize=8)
     return figure
 
