@@ -19,7 +19,7 @@ from torchchain.cli.flags import Predict
 from torchchain.cli.runs import config_of, merged_tables
 from torchchain.energy import StartEnergy, excited, start_energy
 from torchchain.ensemble.scene import Scene
-from torchchain.ensemble.scene_file import regular_times
+from torchchain.ensemble.scene_file import TIMES, regular_times
 from torchchain.ensemble.stages import Stages
 from torchchain.master import SOLVERS, MasterEquation, MasterFamily
 from torchchain.results import model_file
@@ -103,7 +103,7 @@ def _times(times: Any) -> torch.Tensor:
     if not isinstance(times, Mapping):
         return checks.times("times", times)
     checks.known_keys("times", times, ("start", "stop", "step"))
-    return regular_times(times.get("start", 0.0), times.get("stop", 50.0), times.get("step", 0.25))
+    return regular_times(**{**TIMES, **times})
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from torchchain.ensemble import ranks
 from torchchain.ensemble.checkpoint import Checkpoint, Interrupted
 from torchchain.ensemble.measured_transfer import THEORY
 from torchchain.ensemble.scene import Scene
-from torchchain.ensemble.scene_file import read_toml
+from torchchain.ensemble.scene_file import TIMES, read_toml
 from torchchain.ensemble.stages import Stages
 from torchchain.evolvers import METHODS
 from torchchain.threads import beside
@@ -168,5 +168,5 @@ def scene_of(config: dict[str, Any], flags: SceneFlags) -> Scene:
     """The scene of config file and flags."""
     given = flags.overrides()
     if isinstance(given.get("times"), Mapping) and not isinstance(config.get("times"), Mapping):
-        config = {**config, "times": {"start": 0.0, "stop": 50.0, "step": 0.25}}
+        config = {**config, "times": TIMES}
     return Scene.from_dict(merged_tables(config, given))

@@ -28,6 +28,7 @@ from torchchain.cli.runs import config_of
 from torchchain.cli.simulate import run_simulate
 from torchchain.ensemble.ranks import rank_of_environment
 from torchchain.ensemble.scene import Scene
+from torchchain.ensemble.scene_file import TIMES
 from torchchain.progress import log
 from torchchain.results import RunFolder
 
@@ -156,16 +157,11 @@ def combinations(fields: Mapping[str, Sequence[Any]], config: Mapping[str, Any])
             *tables, last = name.split(".")
             table = whole
             for key in tables:
-                if not isinstance(table.setdefault(key, _default(key)), dict):
+                if not isinstance(table.setdefault(key, dict(TIMES) if key == "times" else {}), dict):
                     raise checks.fail(name, "name a field of the scene file", checks.shown(table[key]))
                 table = table[key]
             table[last] = value
         yield Point(",".join(f"{n}={v}" for n, v in zip(fields, values, strict=True)).replace("/", "_"), values, whole)
-
-
-def _default(table: str) -> dict[str, Any]:
-    """What a table that the file does not have holds: the command's own default for the times."""
-    return {"start": 0.0, "stop": 50.0, "step": 0.25} if table == "times" else {}
 
 
 def _done(folder: Path, text: str) -> bool:

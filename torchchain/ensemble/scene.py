@@ -30,7 +30,7 @@ from torchchain.ensemble.scene_checks import (
     check_records,
     left_out,
 )
-from torchchain.ensemble.scene_file import OF_LATTICES, OF_MIXTURES, dict_of, fields_of, read_toml, regular_times
+from torchchain.ensemble.scene_file import OF_LATTICES, OF_MIXTURES, TIMES, dict_of, fields_of, read_toml, regular_times
 from torchchain.ensemble.scene_words import rows_of
 from torchchain.evolvers import METHODS, Method
 from torchchain.network.evolvers import METHODS as NETWORK_METHODS
@@ -122,7 +122,7 @@ class Scene(Printed, checks.Fields):
     boundary: str = "periodic"
     disorder: Disorder = field(default_factory=Disorder)
     excitation: Impulse | StandingWave = field(default_factory=StandingWave)
-    times: Any = field(default_factory=lambda: regular_times(0.0, 50.0, 0.25))
+    times: Any = field(default_factory=lambda: regular_times(**TIMES))
     n_bands: int = None  # type: ignore[assignment]
     realizations: int = 100
     seed: int = 0

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse, "standing_wave": StandingWave}
 MOST_TIMES = 10**7
+TIMES = {"start": 0.0, "stop": 50.0, "step": 0.25}
+"""Of a scene that names none, and what a table of times that a flag begins leaves out."""
 OF_LATTICES = {"shape": None, "motion": "vector", "removed_bonds": 0.0, "position_disorder": 0.0}
 """Fields that lattices alone have, with their defaults."""
 OF_MIXTURES = {"species": (), "arrangement": "random", "unlike": None, "by_species": False}
