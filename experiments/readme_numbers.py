@@ -98,6 +98,8 @@ NUMBERS = (
     Number("**0.0098** for the model", "quality", row("chosen"), 0.009, 0.0125, True),
     Number("0.0112 for the 100 chains", "quality", row("100 chains"), 0.009, 0.0135, True),
     Number("0.29 for the paper's model", "quality", row("procedure L"), 0.26, 0.32, True),
+    Number("the theory with none (0.0069)", "few_numbers", row("xi = 0.3: theory"), 0.006, 0.0078),
+    Number("ξ = 0.1 (0.0042)", "few_numbers", row("xi = 0.1: theory"), 0.0036, 0.0048),
     Number("T(2 t) differs from T(t)^2 by 30 times the noise", "markov_tests", markov_ratio, 20.0, 45.0, True),
     Number("0.95 times as fast", "transfer_speed", row("modes: times faster than the recipe"), 0.7, 3.0, True),
     Number("7.0 times faster than chain by chain", "transfer_speed", row("stencil: times faster than the recipe"), 5.0, 15.0, True),
