@@ -56,7 +56,7 @@ class Config:
 
 
 SMOKE = Config(
-    size=48, realizations=1, strengths=(0.2,), square_scalar=(0.2, 0.25), triangular_longitudinal=(0.15, 0.2),
+    size=32, realizations=1, strengths=(0.2,), square_scalar=(0.2, 0.25), triangular_longitudinal=(0.15, 0.2),
     triangular_transverse=(0.2, 0.25), grid=100,
 )  # fmt: skip
 

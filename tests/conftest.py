@@ -1,5 +1,6 @@
 """What the tests share: one thread, one look at the flags' sources, a small ensemble."""
 
+import gc
 import os
 from functools import cache
 
@@ -15,6 +16,13 @@ from torchchain import cli
 from torchchain.cli import entry, outputs
 
 RENDERED = outputs.figure
+
+
+def pytest_collection_finish():
+    """All that was imported stays: garbage is looked for among what tests make alone, and less often."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(cli.GARBAGE)
 
 
 @pytest.fixture(autouse=True, scope="session")
