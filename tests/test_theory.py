@@ -239,6 +239,13 @@ def test_clusters_of_light_particles_beat():
     assert float(theory_transfer(disorder, 256, 32, [8.0], tones=[2]).mean.min()) > -5e-4
 
 
+def test_weak_disorder_does_not_depend_on_the_law():
+    times = [1.0, 16.0, 39.0, 100.0, 399.0]
+    binary, normal = (theory_transfer(tc.Disorder(kind, 0.005), 64, 8, times).mean for kind in ("binary", "normal"))
+    assert float(distance(binary, normal).max()) < 5e-5  # of 8e-4 that the disorder does
+    assert float(distance(binary, torch.eye(8, dtype=torch.float64)[:, None]).max()) > 5e-4
+
+
 def test_localization_is_what_the_ladder_lacks_at_late_times(chains):
     disorder = tc.Disorder(strength=0.2)
     whole, ladder = (theory_transfer(disorder, 64, 8, TIMES, localization=x) for x in (True, False))

@@ -40,7 +40,7 @@ _EARLY, _ENOUGH = 40.0, 60.0  # end of the first stretch of times, and of what i
 _DECAY, _LATE_DECAY = 6.0, 4.0  # eta times period: of the next period's, against what exp(eta t) makes of errors
 _SMOOTH, _LATE_SMOOTH = 0.8, 0.225  # widths of the windows at the spectrum's end
 _BEYOND = 0.4  # above the edge of the spectrum by this, the medium is exact enough
-_ORDERS, _EARLY_ORDERS = 32, 24
+_ORDERS, _EARLY_ORDERS = 32, 36
 _OVERSAMPLED, _RADIUS = 3, 0.9  # nodes an order, on a circle of this radius, for Taylor coefficients
 _FAR = 2.3  # from here on |2 - z^2 m| is far from resonance
 
