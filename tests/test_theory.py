@@ -295,8 +295,9 @@ def test_damped_disordered_chains():
     assert bool((distance(result.mean, measured.mean) <= 0.01).all())
 
 
-def test_transfer_does_not_depend_on_how_times_are_asked_for():
-    disorder = tc.Disorder(strength=0.3)
+@pytest.mark.parametrize("kind", ["normal", "binary"])
+def test_transfer_does_not_depend_on_how_times_are_asked_for(kind):
+    disorder = tc.Disorder(kind, strength=0.3)
     many = theory_transfer(disorder, 64, 8, torch.linspace(0, 100, 11, dtype=torch.float64))
     few = theory_transfer(disorder, 64, 8, [30.0, 100.0])
     torch.testing.assert_close(many.mean[:, [3, 10]], few.mean, rtol=0, atol=1e-6)

@@ -106,12 +106,10 @@ def mean_wave_energy(law: Law, waves: Waves, times: Tensor) -> tuple[Tensor, Ten
     medium = torch.ones(len(waves.sources), len(times), dtype=torch.float64)
     exact = medium.clone()
     edge = spectrum_edges(law)[0]
-    for start, stop in ((0.0, _EARLY), (_EARLY, min(LAST, float(times[-1])))):
+    for start, stop in ((0.0, _EARLY), (_EARLY, LAST / 2), (LAST / 2, LAST)):
         inside = (times > start) & (times <= stop)
-        if bool(inside.any()):
-            found = _energies(
-                law, waves, times[inside], _stretch(start, float(times[inside][-1]), edge), edge + _BEYOND
-            )
+        if bool(inside.any()):  # by one grid, whatever times are asked for
+            found = _energies(law, waves, times[inside], _stretch(start, stop, edge), edge + _BEYOND)
             medium[:, inside], exact[:, inside] = found
     gone = (2 * times / LAST - 1).clamp(0, 1)
     medium[:, times > LAST] = exact[:, times > LAST] = 0
