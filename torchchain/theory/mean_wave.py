@@ -42,6 +42,7 @@ _SMOOTH, _LATE_SMOOTH = 0.8, 0.225  # widths of the windows at the spectrum's en
 _BEYOND = 0.4  # above the edge of the spectrum by this, the medium is exact enough
 _ORDERS, _EARLY_ORDERS = 32, 36
 _OVERSAMPLED, _RADIUS = 3, 0.9  # nodes an order, on a circle of this radius, for Taylor coefficients
+_BLOCK = 100  # frequencies at a time
 _FAR = 2.3  # from here on |2 - z^2 m| is far from resonance
 
 
@@ -129,12 +130,13 @@ def _energies(law: Law, waves: Waves, times: Tensor, stretch: Stretch, highest: 
     ring = 1 / (waves.sources[:, None] - inner.square() * mass)
     below = int((z.real < highest).sum())
     orders = _ORDERS if stretch.start > 0 else _EARLY_ORDERS
-    exact, medium = mean_resolvent(inner[:below], law, waves.wavenumbers, orders)
-    change = torch.nn.functional.pad(exact - medium, (0, len(z) - below))
+    found = [mean_resolvent(some, law, waves.wavenumbers, orders) for some in inner[:below].split(_BLOCK)]
+    change = torch.cat([exact - medium for exact, medium in found], dim=-1)
+    change = torch.nn.functional.pad(change, (0, len(z) - below))
     whole, loss = mirrored(z, -1), mirrored(loss)
     window = window_of(whole, stretch)
-    found = [
+    energies = [
         coherent_energy(law, waves, times, stretch, whole, mirrored(mean) / loss, loss, window)
         for mean in (ring, ring + change)
     ]
-    return found[0], found[1]
+    return energies[0], energies[1]
