@@ -88,6 +88,7 @@ def rungs(config: Config) -> list[tuple[str, str | None, str | None, dict[str, A
         (f"memory {single}+{pairs}", "projection", "memory", {"order": (single, pairs), "bootstrap": 0})
         for single, pairs in ORDERS[::2]
     ]
+    found.append(("memory, certified", "projection", "memory", {"bootstrap": 0}))
     return [*found, ("chosen", None, None, {})]
 
 
@@ -226,7 +227,8 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
 
 def _ladder(ax: Axes, data: xarray.Dataset, config: Config) -> None:
     for i, model in enumerate(dict.fromkeys(data.model.values)):
-        part = data.isel(entry=(data.model == model).values & (data.label != "chosen").values).sortby("parameters")
+        kept = ~np.isin(data.label.values, ["chosen", "memory, certified"])
+        part = data.isel(entry=(data.model == model).values & kept).sortby("parameters")
         ax.plot(part.parameters, part.distance, "os^vDPXh"[i % 8], ls="-" if model == "memory" else "", color=f"C{i}", label=model)
     chosen = data.isel(entry=(data.label == "chosen").values)
     ax.plot(
@@ -291,7 +293,7 @@ def compare(data: xarray.Dataset, config: Config) -> list[Row]:
             f"within error {float(line.covered):.2f}, {float(line.covered_mixed):.2f}, "
             f"ensemble / prediction {float(line.ensemble_seconds / line.prediction_seconds):.2g}"
         )
-        order = f" {line.order.item()}" if line.label.item() == "chosen" else ""
+        order = f" {line.order.item()}" if line.label.item() in ("chosen", "memory, certified") else ""
         name = (
             f"xi {float(line.strength):g}, N {int(line.n_particles)}, B {int(line.n_bands)}: {line.label.item()}{order}"
         )
