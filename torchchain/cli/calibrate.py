@@ -79,7 +79,9 @@ def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:
         raise checks.FieldTypeError(f"calibration must be a table, got {checks.shown(table)}")
     settings = merged_tables(table, flags.calibration())
     fits = [name for fit in methods().values() for name in fit.settings_names]
-    checks.known_keys("calibration", settings, ("method", "model", "window", "bootstrap", "starts", *dict.fromkeys(fits)))
+    checks.known_keys(
+        "calibration", settings, ("method", "model", "window", "bootstrap", "starts", *dict.fromkeys(fits))
+    )
     for name in ("window", "order"):
         if isinstance(settings.get(name), list):
             settings[name] = tuple(settings[name])

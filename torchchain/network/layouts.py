@@ -56,7 +56,9 @@ class Gathered:
         self.order = np.arange(n)
         if n > RENUMBER:
             near = end < n
-            graph = scipy.sparse.coo_matrix((np.ones(near.sum(), np.int8), (owner[near], end[near])), shape=(n, n)).tocsr()
+            graph = scipy.sparse.coo_matrix(
+                (np.ones(near.sum(), np.int8), (owner[near], end[near])), shape=(n, n)
+            ).tocsr()
             self.order = scipy.sparse.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
         neighbors = np.bincount(owner, minlength=n)[self.order]
         window = np.arange(n) // WINDOW
