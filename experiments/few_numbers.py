@@ -92,6 +92,7 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
         ax.axhline(float(part.noise[0]), color="gray", ls=":", label=f"{config.realizations} chains themselves")
         ax.axhline(float(part.noise[1]), color="k", ls="--", lw=0.8, label=f"noise of {config.fresh} chains")
         ax.set(xscale="log", yscale="log", ylim=(lowest, highest), xlabel="fitted numbers", title=f"$\\xi$ = {xi:g}")
+        ax.set_xticks([1, 10, 100, 1000, 10_000], ["0", "10", "100", "1000", "10000"])  # none stands where 1 would
         ax.label_outer()
     axes[0, 0].set_ylabel("total variation")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=7)
