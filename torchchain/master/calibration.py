@@ -25,7 +25,7 @@ from torchchain.master.rates import RateModel
 from torchchain.master.records import Fit, NoSettings, Recipe, ReducedModel
 from torchchain.master.report import Calibration, Report
 from torchchain.master.sample import Sample, loss_of
-from torchchain.master.selection import nearest_sure, select
+from torchchain.master.selection import select
 from torchchain.master.starts import can_fit, fit_starts, with_errors
 from torchchain.master.uncertainty import draw_again, horizon
 from torchchain.progress import bar
@@ -162,7 +162,7 @@ def calibrate(
     count = replicates(bootstrap, asked.fit, transfer)
     if transfer.is_ordered:
         return _ordered(transfer, asked)
-    report, near, errors = Report(), None, None
+    report, near, spare, errors = Report(), None, None, None
     starts = partial(fit_starts, transfer) if can_fit(transfer) else lambda: None
     with (
         single_blas_thread() as threads,
@@ -170,20 +170,19 @@ def calibrate(
         bar("calibrating", None, "step", progress) as shown,
     ):
         if not asked.complete:
-            asked, selection, near = select(transfer, asked, shown.update, threads)
+            asked, selection, near, spare = select(transfer, asked, shown.update, threads)
             report = replace(report, selection=selection)
         sample = Sample.of(transfer)
         fitted, told = asked.run(sample, near, shown.update)
         free, proof = fitted, None
         if isinstance(fitted, MemoryModel) and isinstance(told, ProjectionReport) and not sample.damped:
-            other = None if report.selection is None else nearest_sure(asked, report.selection)
             fitted, told, proof = certified(
-                transfer, asked, (fitted, told), report.selection is not None, shown.update, other is not None
+                transfer, asked, (fitted, told), report.selection is not None, shown.update, spare is not None
             )
             if (
-                proof is None and other is not None
+                proof is None and spare is not None
             ):  # nothing that may be negative is handed out where another can be had
-                asked = other
+                asked = spare
                 fitted, told = asked.run(sample, None, shown.update)
                 free = fitted
         report = replace(

@@ -27,8 +27,6 @@ AS_GOOD = 1.1
 """Foreseen distance, over that of the nearest model, of a smaller one that takes its place."""
 LARGE = 500
 """Fitted numbers beyond which a model is tried only where no smaller one will do."""
-MANY = 10**9
-"""Times that tell all rungs of a model apart."""
 SEEN = 128
 """Times at which models are compared with the half that they have not seen."""
 ENOUGH = 1.05
@@ -80,7 +78,7 @@ def _batches(candidates: list[Recipe], transfer: BandTransfer) -> Iterator[list[
 
 def select(
     transfer: BandTransfer, asked: Recipe, progress: Progress = None, workers: int = 1
-) -> tuple[Recipe, Selection, TransferModel | None]:
+) -> tuple[Recipe, Selection, TransferModel | None, Recipe | None]:
     """The first rung that, fitted on every other block, predicts the rest as well as the fitted blocks' means do.
 
     As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time will do if,
@@ -90,12 +88,13 @@ def select(
     are fitted side by side on as many threads as there are ``workers``, one thread of BLAS each.
 
     Returns:
-        The recipe of the rung, what was tried, and the model fitted to half of the blocks.
+        The recipe of the rung, what was tried, the model fitted to half of the blocks, and of the rungs that were tried the
+        nearest whose energies are never negative by its form.
     """
     candidates = rungs(asked, transfer)
     blocks = len(transfer.block_counts)
     if blocks < 4:
-        return _untested(candidates), Selection("largest: too few blocks of realizations to hold some out"), None
+        return _untested(candidates), Selection("largest: too few blocks of realizations to hold some out"), None, None
     even = (torch.arange(blocks) + 1) % 2
     parts = Sample.of_blocks(transfer, even), Sample.of_blocks(transfer, 1 - even)
     seen = kept_times(transfer.times, SEEN)
@@ -177,21 +176,9 @@ def select(
         best = min(range(len(tried)), key=lambda i: tried[i].distance)
     reached = "reaches" if enough else "comes nearest to"
     reason = f"smallest model that {reached} the distance of the two halves of the ensemble"
-    return chosen[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best]
-
-
-def nearest_sure(asked: Recipe, selection: Selection) -> Recipe | None:
-    """Of the rungs that were tried, the nearest whose energies are never negative by its form."""
-    sure = [rung for rung in selection.tried if MODELS[rung.model].never_negative]
-    if not sure:
-        return None
-    rung = min(sure, key=lambda each: each.distance)
-    record = MODELS[rung.model]
-    fit = record.fit(record.climbed_by or "")
-    settings = next(
-        s for s in record.rungs(MANY) if replace(asked, model=record, fit=fit, settings=s).order == rung.order
-    )
-    return replace(asked, model=record, fit=fit, settings=settings)
+    sure = [i for i, rung in enumerate(tried) if MODELS[rung.model].never_negative]
+    spare = chosen[min(sure, key=lambda i: tried[i].distance)] if sure else None
+    return chosen[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best], spare
 
 
 def foreseen(halves: Tensor, missed: Tensor, spread: Tensor) -> Tensor:
