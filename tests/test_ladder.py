@@ -295,8 +295,9 @@ def test_negative_energies_warn():
 
 def test_what_a_scene_asks_beyond_the_calibration(small_transfer):
     master = tc.calibrate(small_transfer)
-    scene = small_transfer.scene
+    scene = replace(small_transfer.scene, tolerance=0.1)
     assert master.concerns(scene) == []
+    assert tc.plan(scene, master).method == ARTIFACT  # so that it is the changes that speak against the model
     changes = [
         ({"disorder": tc.Disorder(strength=0.2)}, "disorder 0.2, calibrated on 0.3"),
         ({"disorder": tc.Disorder("uniform", strength=0.3)}, "another kind of disorder"),
