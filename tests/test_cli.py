@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -212,6 +213,11 @@ def test_plan(run):
     status, output, errors = run("plan", "--n-particles", "32", "--n-bands", "4")
     assert (status, errors) == (0, "")
     assert "method" in output
+    words = re.search("a calibration measures other starts as well: (.+) s more predicted", output)
+    assert words is not None
+    assert float(words[1]) > 0
+    _, output, _ = run("plan", "--n-particles", "32", "--n-bands", "4", "--damping", "0.1")
+    assert "other starts" not in output
 
 
 # What goes wrong

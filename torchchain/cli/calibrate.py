@@ -22,6 +22,7 @@ from torchchain.cli.report import shares_left
 from torchchain.cli.runs import Run, config_of, merged_tables, running, scene_of
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.measured_transfer import band_transfer, measured_observables
+from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.scene_words import describe
 from torchchain.ensemble.starts import start_scene
 from torchchain.ensemble.statistics import statistical_distance, total_variation
@@ -68,9 +69,13 @@ def run_calibrate(
             ensemble = replace(found.scene, observables=measured_observables(found.scene))
             forecast = planning.forecast(ensemble, found.attributes, run.spent, float(found.stderr.max()))
             if found.starts is not None and "predicted_seconds" in forecast:
-                more = planning.forecast(start_scene(found.scene), found.attributes, 0.0, 0.0)
-                forecast["predicted_seconds"] += more["predicted_seconds"]
+                forecast["predicted_seconds"] += seconds_of_starts(found.scene, found.attributes)
             _leave(run, found, settings, starts, forecast, run.how(ensemble, found.attributes), shown)
+
+
+def seconds_of_starts(scene: Scene, how: Mapping[str, Any]) -> float:
+    """What the other starts of a scene are predicted to take, by the ``method`` and ``method_options`` of its transfer."""
+    return float(planning.forecast(start_scene(scene), how, 0.0, 0.0).get("predicted_seconds", 0.0))
 
 
 def _settings(table: Any, flags: Calibrate) -> dict[str, Any]:

@@ -1,6 +1,7 @@
-"""Compact models of several strengths of disorder, fitted together: their coefficients are polynomials of sqrt(xi).
+"""Compact models of several strengths of disorder, fitted together: their coefficients are the theory's and polynomials of sqrt(xi).
 
-The waves of a strength are known, and D is proportional to xi^2: what the coefficients have to tell changes slowly with xi.
+The theory of disorder is exact at early times and near at late ones: what chains have to tell beyond it changes slowly with xi.
+Where it does not describe the chains, the polynomials are of the coefficients themselves: D is proportional to xi^2.
 Any coefficients make a model that is never negative and conserves energy, so every strength in between has one.
 """
 
@@ -28,7 +29,7 @@ from torchchain.master.compact_record import (
     regression_of,
     shares_of,
 )
-from torchchain.master.derived import THEORY, TheoryModel, compared
+from torchchain.master.derived import THEORY, TheoryModel, compared, derived
 from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import Regression, fit_compact, solve, stepped
@@ -44,14 +45,22 @@ SETS = 5
 """Polynomials of sqrt(xi), at most: 1,410 fitted numbers with these degrees."""
 STIFFNESS = 1000.0
 """Ridge of the first of them, relative to that of a model alone; the next have 4, 9, 16 times as much."""
-THEORY_TIMES = torch.cat([torch.linspace(0.25, 3, 12), torch.logspace(math.log10(3.5), math.log10(400), 36)]).double()
-THEORY_FROM = (5.0, 50.0)
-"""Before the first of these times perturbation theory is exact to more digits than the theory has, from the second on it is not."""
-THEORY_ERROR = 0.3
-"""Distance to which the theory is followed, of the energy that has moved: for coefficients that are small, and change slowly."""
+THEORY_TIMES = torch.cat([
+    torch.tensor([0.01, 0.03, 0.06, 0.1, 0.15]), torch.linspace(0.2, 3, 13), torch.logspace(math.log10(3.5), math.log10(400), 36),
+]).double()  # fmt: skip
+THEORY_ERROR = 0.01
+"""Distance to which the theory is followed, of the energy that has moved."""
+BELOW = (10, 7, 20)
+"""Degrees of models below the lowest member, whose coefficients are derived and not fitted to chains."""
+SCATTERINGS = 10.0
+"""xi^2 tan^2(k/2) t from which on what the theory misses grows no more."""
+LEAST = 1e-12
+"""Share of the energy that odds are told from."""
 WEAKEST = 1e-9
 """In place of no disorder, where nothing moves."""
 
+MOST_KEPT = 32
+"""Sets of the theory's coefficients that are kept: one for each member of a family, and for strengths that were asked for."""
 THEORY_WEAKEST = 1e-3
 """Weakest disorder of which the theory is asked for coefficients: the energy that leaves a band, some xi^2, nears rounding."""
 
@@ -77,9 +86,9 @@ def weights(strength: float, known: Sequence[float], sets: int) -> np.ndarray:
 def between(members: Sequence[MasterEquation], scene: Scene, sets: int, power: int = 2) -> CompactModel:
     """The model of a scene whose strength may lie between those of members that were fitted together.
 
-    Below the lowest strength the coefficients go to zero as xi^2, for D is perturbation theory, exact in that limit, and what
-    it leaves out is of order xi^2 t; where the theory of disorder describes the chains, what goes to zero is the difference
-    from its own coefficients. What damped chains have left is a mixture of that of the nearest two strengths.
+    Where the theory of disorder describes the chains, it is what the coefficients differ from it by that is a polynomial; below
+    the lowest strength see :func:`_below`. Elsewhere they go to zero below the lowest as xi^2, for D is perturbation theory,
+    exact in that limit, and what it leaves out is of order xi^2 t. What damped chains have left is a mixture of that of the nearest two strengths.
     """
     known = [member.calibration.strength or WEAKEST for member in members]
     strength = max(scene.disorder.strength, WEAKEST)
@@ -93,32 +102,84 @@ def between(members: Sequence[MasterEquation], scene: Scene, sets: int, power: i
     beside = 0.0 if other is None else other.strength
     waves = Waves.of(scene, math.hypot(strength, beside))
     mixed = {name: summed(name, near) for name in ("rates", "loss")}
-    mixed["coefficients"] = summed("coefficients", weights(strength, known, sets).tolist())
-    if strength < known[0]:
-        told = max(strength, THEORY_WEAKEST)
-        here, there = (
-            _told_by_theory(replace(scene, disorder=replace(scene.disorder, strength=xi)), tensors[0]["degrees"])
-            for xi in (told, known[0])
-        )
-        here = here * (strength / told) ** power
-        share = ((strength**2 + beside**2) / (known[0] ** 2 + beside**2)) ** (power / 2)
-        mixed["coefficients"] = here + share * (mixed["coefficients"] - there)
+    degrees = checked_degrees([int(degree) for degree in tensors[0]["degrees"]])
+    told = max(strength, THEORY_WEAKEST)
+    fewer = (told**2 + beside**2) / (known[0] ** 2 + beside**2)
+    if strength < known[0] and _described(scene):
+        mixed["coefficients"] = _fitted(_at(scene, told), _below(members[0], _at(scene, told), _fit_times()), BELOW)
+        mixed["coefficients"] *= (strength / told) ** power
+        mixed["degrees"] = torch.tensor(BELOW, dtype=torch.float64)
+    elif strength < known[0]:
+        mixed["coefficients"] = summed("coefficients", near) * fewer ** (power / 2) * (strength / told) ** power
+    else:
+        shares = weights(strength, known, sets).tolist()
+        mixed["coefficients"] = _guide(_at(scene, strength), degrees) + summed("coefficients", shares)
+        for share, xi in zip(shares, known, strict=True):
+            mixed["coefficients"] = mixed["coefficients"] - share * _guide(_at(scene, xi), degrees)
     return CompactModel(**tensors[0] | mixed | waves.tensors())
 
 
-def _told_by_theory(scene: Scene, given: Tensor) -> Tensor:
-    """Coefficients, of given degrees, of the compact form for what the theory of disorder says of chains; zero if nothing."""
-    degrees = checked_degrees([int(degree) for degree in given])
-    if scene.damping or not compared(scene) or not THEORY.describes(scene):
+def _at(scene: Scene, strength: float) -> Scene:
+    return replace(scene, disorder=replace(scene.disorder, strength=strength))
+
+
+def _described(scene: Scene) -> bool:
+    """Whether the theory of disorder can guide the models of a scene's strengths."""
+    return not scene.damping and compared(scene) and THEORY.describes(scene)
+
+
+def _below(lowest: MasterEquation, scene: Scene, times: Tensor, power: int = 2) -> Tensor:
+    """T at a strength below the lowest: of the theory, its odds mended by some of what the lowest model tells of it."""
+    model, there = lowest.model, lowest.calibration.scene
+    assert isinstance(model, CompactModel), "a family's constructor has checked it"
+    assert there is not None, "likewise"
+    own = model.at(times.to(model.rates)).double()
+    missed = [_odds(found).log() for found in (own, derived(TheoryModel.of(there).ring, times))]
+    share = _shared(there, scene, times) ** (power / 2)
+    odds = _odds(derived(TheoryModel.of(scene).ring, times)) * (share * (missed[0] - missed[1])).exp()
+    return odds / odds.sum(-1, keepdim=True)
+
+
+def _shared(lowest: Scene, scene: Scene, times: Tensor) -> Tensor:
+    """How much of what the theory misses of the odds at the lowest strength it misses at a smaller one, [source, time, receiver].
+
+    That grows as the variance of the masses at first, and where waves have been scattered back no longer.
+    """
+    k = 2 * math.pi / scene.n_particles * torch.tensor(scene.tones, dtype=torch.float64)
+    rate = lowest.disorder.strength**2 * torch.tan(k.clamp(max=0.99 * math.pi) / 2).square()[:, None] / SCATTERINGS
+    fewer = (scene.disorder.strength / lowest.disorder.strength) ** 2
+    share = fewer * (1 + rate * times) / (1 + fewer * rate * times)  # [band, time]
+    share = torch.where(times.isinf(), torch.ones_like(share), share)
+    return (share[:, :, None] * share.T).sqrt()
+
+
+def _odds(transfer: Tensor) -> Tensor:
+    """Of the bands against the source's own, [source, time, receiver]."""
+    transfer = transfer.clamp(min=LEAST)
+    return transfer / transfer.diagonal(dim1=0, dim2=2).T[..., None]
+
+
+_guides: dict[Any, Tensor] = {}
+
+
+def _guide(scene: Scene, degrees: tuple[int, int, int]) -> Tensor:
+    """Coefficients of the compact form for what the theory of disorder says of a scene's chains; zero if nothing."""
+    if not _described(scene):
         return torch.zeros(n_coefficients(degrees), dtype=torch.float64)
-    times = torch.cat([THEORY_TIMES, THEORY_TIMES.new_tensor([math.inf])])
-    none = torch.zeros(n_coefficients(degrees), dtype=torch.float64)
-    plain = CompactModel(
-        rates=torch.zeros(scene.n_bands, scene.n_bands, dtype=torch.float64), degrees=given.double(), coefficients=none,
-        **Waves.of(scene).tensors(),
-    ).at(times)  # fmt: skip
-    late = (times.log() - math.log(THEORY_FROM[0])) / math.log(THEORY_FROM[1] / THEORY_FROM[0])
-    transfer = torch.lerp(plain, TheoryModel.of(scene).transfer(times), late.clamp(0, 1)[:, None])
+    theory = TheoryModel.of(scene)
+    if (theory.ring, degrees) not in _guides:
+        while len(_guides) >= MOST_KEPT:
+            _guides.pop(next(iter(_guides)), None)
+        _guides[theory.ring, degrees] = _fitted(scene, derived(theory.ring, _fit_times()), degrees)
+    return _guides[theory.ring, degrees]
+
+
+def _fit_times() -> Tensor:
+    return torch.cat([THEORY_TIMES, THEORY_TIMES.new_tensor([math.inf])])
+
+
+def _fitted(scene: Scene, transfer: Tensor, degrees: tuple[int, int, int]) -> Tensor:
+    """Coefficients of the compact form for a transfer at ``THEORY_TIMES`` and in the end."""
     with single_blas_thread():
         moved = 1 - transfer[:, :-1].diagonal(dim1=0, dim2=2).mean(-1)
         model, _ = fit_compact(
@@ -146,11 +207,20 @@ def fit_together(
         sets: polynomials of sqrt(xi), no more than there are samples.
         progress: called with 1 after every step.
     """
-    problems = [regression_of(sample, degrees) for sample in samples]
+    guides = _guides_of(samples, degrees)
+    problems = [regression_of(sample, degrees).guided(guide) for sample, guide in zip(samples, guides, strict=True)]
     mixing = _mixing(samples, sets)
     with single_blas_thread():
         found, told = solve(problems, mixing, _start(problems, mixing, progress), progress, _stiffness(mixing.shape[1]))
-    return mixing @ found, CompactReport(told["converged"], told["steps"], told["misfit"], degrees, mixing.shape[1])
+    return guides + mixing @ found, CompactReport(
+        told["converged"], told["steps"], told["misfit"], degrees, mixing.shape[1]
+    )
+
+
+def _guides_of(samples: Sequence[Sample], degrees: tuple[int, int, int]) -> np.ndarray:
+    """What the theory says of each sample, (sample, coefficient)."""
+    scenes = [sample.scene for sample in samples]
+    return np.stack([_guide(scene, degrees).numpy() for scene in scenes if scene is not None])
 
 
 def _start(problems: Sequence[Regression], mixing: np.ndarray, progress: Callable[[int], Any] | None) -> np.ndarray:
@@ -230,10 +300,13 @@ def _errors(
     """Error bars of all models: the blocks of every ensemble are drawn again, each time by one step from the solution."""
     repeats = [block_draws(len(transfer.block_counts), replicates, i) for i, transfer in enumerate(transfers)]
     mixing = _mixing(samples, sets)
-    problems = [regression_of(sample, models[0].degrees_) for sample in samples]
-    found = np.linalg.pinv(mixing) @ np.stack([model.coefficients.numpy() for model in models])
+    guides = _guides_of(samples, models[0].degrees_)
+    problems = [
+        regression_of(sample, models[0].degrees_).guided(guide) for sample, guide in zip(samples, guides, strict=True)
+    ]
+    found = np.linalg.pinv(mixing) @ (np.stack([model.coefficients.numpy() for model in models]) - guides)
     drawn = [drawn_again(transfer, repeat) for transfer, repeat in zip(transfers, repeats, strict=True)]
-    others = np.einsum(
+    others = guides[:, None] + np.einsum(
         "ms,rsc->mrc", mixing, stepped(problems, mixing, found, [shares_of(each) for each in drawn], _stiffness(sets))
     )
     return [
@@ -277,7 +350,7 @@ def errors_between(
 ) -> Uncertainty | None:
     """Error bars of the model of a scene between those of members: theirs, and by how much interpolation may be off.
 
-    Errors of the odds are interpolated between the nearest two strengths. What interpolation is off by is taken from the
+    Errors of the odds are those of a mixture of the nearest two strengths', which are independent. What interpolation is off by is taken from the
     distance to a polynomial of sqrt(xi) of one degree less.
     """
     held = [(member, member.uncertainty) for member in members if member.uncertainty is not None]
@@ -285,21 +358,24 @@ def errors_between(
         return None
     known, strength = [member.calibration.strength or WEAKEST for member in members], scene.disorder.strength
     shares = nearest(strength, known)
+    guided = strength < known[0] and _described(scene)
+    told = _at(scene, max(strength, THEORY_WEAKEST))
     times = held[shares.index(max(shares))][1].times
     eye, here = torch.eye(model.n_bands, dtype=torch.float64), model.transfer(times).detach()
     variance, slopes, bases = torch.zeros_like(here), torch.zeros_like(eye), torch.zeros_like(eye)
     for weight, (member, errors) in zip(shares, held, strict=True):
         if weight:
-            scale = _odds_slope(here) / _odds_slope(member.model.transfer(times).detach())
-            variance += weight * (errors.of(eye, times) * scale).square()
-            bases += (
-                weight * (errors.basis_stderr * _odds_slope(model.basis) / _odds_slope(member.basis.detach())).square()
-            )
-            slopes += weight * errors.rates_stderr.square()
+            scale = weight * _odds_slope(here) / _odds_slope(member.model.transfer(times).detach())
+            late = weight * _odds_slope(model.basis) / _odds_slope(member.basis.detach())
+            variance += (errors.of(eye, times) * scale).square()
+            bases += (errors.basis_stderr * late).square()
+            slopes += (weight * errors.rates_stderr).square()
+    if guided:
+        variance = variance * _shared(_at(scene, known[0]), told, times).square()
     spread = variance.sqrt()
     if strength not in known and sets > 1:
-        lower = between(members, scene, sets - 1, 1).transfer(times).detach()
-        spread = (variance + model_error(here, lower, spread, spread).square()).sqrt()
+        lower = _below(members[0], told, times, 1) if guided else between(members, scene, sets - 1, 1).transfer(times)
+        spread = (variance + model_error(here, lower.detach(), spread, spread).square()).sqrt()
     return Uncertainty(slopes.sqrt(), bases.sqrt(), times, spread)
 
 

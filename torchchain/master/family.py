@@ -37,8 +37,8 @@ NEIGHBORS = 4
 class MasterFamily(Printed):
     """Master equations of the same bands and chains for several strengths xi of the disorder.
 
-    Compact models are fitted together, with coefficients that are polynomials of sqrt(xi): a strength between them has its
-    own, which is never negative and conserves energy. Members that were calibrated alone are first fitted together to
+    Compact models are fitted together, with coefficients that are the theory's of every strength, where it describes the chains,
+    and polynomials of sqrt(xi): a strength between them has its own, which is never negative and conserves energy. Members that were calibrated alone are first fitted together to
     what they predict.
 
     Of models with memory alone (of damped chains, say) the transfer at a strength between is a weighted sum of those of up

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -113,6 +113,11 @@ class Regression:
         """Derivative of one time's T by the exponents' terms, (source receiver, term)."""
         mean = np.matmul(found[:, None], self.shape)
         return ((self.shape - mean) * (found * weight)[..., None]).reshape(found.size, -1)
+
+    def guided(self, guide: np.ndarray) -> Regression:
+        """The regression for what is to be added to known coefficients, which are multiplied into its odds."""
+        exponent = np.clip(self.shape @ (self.table(guide) @ self.clock.T), -LARGEST_EXPONENT, LARGEST_EXPONENT)
+        return replace(self, odds=self.odds * np.exp(exponent).transpose(0, 2, 1))
 
     def table(self, held: np.ndarray) -> np.ndarray:
         """Coefficients as a table, zeros where none is."""
