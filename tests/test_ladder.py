@@ -197,6 +197,19 @@ def test_strong_disorder_of_other_kinds(kind, strength):
     assert 0.55 < float(((found - fresh.mean).square() <= error)[:, 1:].double().mean()) < 0.85
 
 
+def test_what_is_near_at_all_times_is_not_left_for_a_model_that_nobody_looked_at_early():
+    """Of models that look at each window of time none need do, yet they come before those that do not, if they are as near."""
+    scene = tc.Scene(
+        n_particles=64, n_bands=8, realizations=200, disorder=tc.Disorder(strength=0.0),
+        stiffness_disorder=tc.Disorder(strength=0.3), times=np.concatenate([np.arange(0, 5, 0.25), np.arange(5, 60, 2.5)]),
+    )  # fmt: skip
+    master = tc.calibrate(tc.band_transfer(scene, starts=False), bootstrap=0)
+    selection = master.calibration.report.selection
+    assert min(rung.distance for rung in selection.tried) <= 1.05 * selection.halves_distance
+    assert {rung.model for rung in selection.tried} <= {"theory", "corrected_theory"}
+    assert master.n_parameters <= 80
+
+
 def test_listed_times_choose_as_well_as_times_by_logarithm():
     """However its times are spaced, a model is chosen that is right early and late."""
     scene = tc.Scene(n_particles=48, n_bands=6, realizations=40)

@@ -84,7 +84,7 @@ def select(
     As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time will do if,
     fitted to all blocks, it is foreseen to be within ``near`` times the noise in every one, and is taken if no larger
     one of its like is foreseen to be nearer by more than a tenth, nor one as near that predicts faster. If none will do,
-    the nearest is taken. Models with rates are tried with procedure L. Rungs of different kinds that are tried in any case
+    the nearest is taken; models without windows are tried only where those with are farther than 5 % over all times. Models with rates are tried with procedure L. Rungs of different kinds that are tried in any case
     are fitted side by side on as many threads as there are ``workers``, one thread of BLAS each.
 
     Returns:
@@ -148,6 +148,9 @@ def select(
         for batch in _batches(candidates, transfer):
             if enough and not _is_sure(batch[0], transfer):
                 continue
+            near = [rung.distance for rung in tried if MODELS[rung.model].windows]
+            if near and min(near) <= ENOUGH * noise and not _model(batch[0]).windows:
+                continue  # it would do by the measure of these, which do not look at each window of time
             kinds: dict[type, list[tuple[int, Recipe]]] = {}
             for place, candidate in enumerate(batch):
                 kinds.setdefault(_model(candidate).kind, []).append((place, candidate))
