@@ -229,7 +229,9 @@ def _ladder(ax: Axes, data: xarray.Dataset, config: Config) -> None:
     for i, model in enumerate(dict.fromkeys(data.model.values)):
         kept = ~np.isin(data.label.values, ["chosen", "memory, certified"])
         part = data.isel(entry=(data.model == model).values & kept).sortby("parameters")
-        ax.plot(part.parameters, part.distance, "os^vDPXh"[i % 8], ls="-" if model == "memory" else "", color=f"C{i}", label=model)
+        if part.sizes["entry"]:
+            line = "-" if model == "memory" else ""
+            ax.plot(part.parameters, part.distance, "os^vDPXh"[i % 8], ls=line, color=f"C{i}", label=model)
     chosen = data.isel(entry=(data.label == "chosen").values)
     ax.plot(
         chosen.parameters, chosen.distance, "k*", markersize=10, markerfacecolor="none", label="chosen by calibrate"
