@@ -142,10 +142,10 @@ def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
             "results.nc": outputs.dataset(data.assign(_table(rows))),
             **outputs.figures(figure, flags.format),
             "report.txt": outputs.text(report),
-            "run.json": outputs.reported(
+            outputs.RECORD: outputs.reported(
                 out, arguments, config, flags.device, began, stages,
                 command=shlex.join(["python", f"experiments/{script.name}.py", *arguments]), seed=flags.settings.seed,
-            )["run.json"],
+            )[outputs.RECORD],
         },
     )  # fmt: skip
     print(report, end="")

@@ -19,8 +19,8 @@ import torchchain as tc
 from torchchain import plots
 from torchchain.energy.bands import center_tones
 from torchchain.theory import MEASURED, Return, law_of
-from torchchain.theory.crossed import LAST, crossed_transfer, fading
-from torchchain.theory.ladder import Waves, ladder_transfer, spectrum_edges
+from torchchain.theory.crossed import LAST, crossed_transfer
+from torchchain.theory.ladder import Waves, fading, ladder_transfer, spectrum_edges
 from torchchain.theory.localized import Frequencies, first_part, interference, onset, source_frequencies
 from torchchain.theory.transfer import crossed_part
 
@@ -76,7 +76,7 @@ class Disordered:
 
     def change(self, patterns: list[Tensor], numbers: Return) -> Tensor:
         """What the theory adds to the ladder, [source, time, band]."""
-        fade, change = fading(self.times), []
+        fade, change = fading(self.times, LAST), []
         for s, (spectrum, pattern) in enumerate(zip(self.spectra, patterns, strict=True)):
             late = onset(self.times, spectrum, numbers).T @ pattern.T
             first = first_part(self.times, spectrum, numbers) * fade

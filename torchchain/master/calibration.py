@@ -179,10 +179,8 @@ def calibrate(
             fitted, told, proof = certified(
                 transfer, asked, (fitted, told), report.selection is not None, shown.update, spare is not None
             )
-            if (
-                proof is None and spare is not None
-            ):  # nothing that may be negative is handed out where another can be had
-                asked = spare
+            if proof is None and spare is not None:
+                asked = spare  # nothing that may be negative is handed out where another can be had
                 fitted, told = asked.run(sample, None, shown.update)
                 free = fitted
         report = replace(

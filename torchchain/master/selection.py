@@ -84,8 +84,9 @@ def select(
     As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time will do if,
     fitted to all blocks, it is foreseen to be within ``near`` times the noise in every one, and is taken if no larger
     one of its like is foreseen to be nearer by more than a tenth, nor one as near that predicts faster. If none will do,
-    the nearest is taken; models without windows are tried only where those with are farther than 5 % over all times. Models with rates are tried with procedure L. Rungs of different kinds that are tried in any case
-    are fitted side by side on as many threads as there are ``workers``, one thread of BLAS each.
+    the nearest is taken; models without windows are tried only where those with are farther than 5 % over all times.
+    Models with rates are tried with procedure L. Rungs of different kinds that are tried in any case are fitted side by
+    side on as many threads as there are ``workers``, one thread of BLAS each.
 
     Returns:
         The recipe of the rung, what was tried, the model fitted to half of the blocks, and of the rungs that were tried the

@@ -124,12 +124,6 @@ def crossed_transfer(law: Law, waves: Waves, times: Tensor, edge: float) -> tupl
     return found * begun[:, None], coherent * begun
 
 
-def fading(times: Tensor) -> Tensor:
-    """1 until half of LAST, 0 from LAST on, smoothly between, (time,)."""
-    gone = (2 * times / LAST - 1).clamp(0, 1)
-    return 1 - gone.square() * (3 - 2 * gone)
-
-
 def _variance(law: Law, waves: Waves) -> Tensor:
     """s: of the masses; for random stiffnesses theirs, over their mean squared, in place of the skew compliances'."""
     values = 1 / law.values if waves.momentum else law.values

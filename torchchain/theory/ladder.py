@@ -264,6 +264,12 @@ def mirrored(values: Tensor, sign: int = 1) -> Tensor:
     return torch.cat([sign * values.flip(-1).conj(), values], dim=-1)
 
 
+def fading(times: Tensor, last: float) -> Tensor:
+    """1 until half of the last time, 0 from it on, smoothly between, (time,)."""
+    gone = (2 * times / last - 1).clamp(0, 1)
+    return 1 - gone.square() * (3 - 2 * gone)
+
+
 def window_of(z: Tensor, stretch: Stretch) -> Tensor:
     """1 on the spectrum, smoothly 0 beyond: in time a kernel narrower than the stretch's distance from 0."""
     at = z.numpy()

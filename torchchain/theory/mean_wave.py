@@ -24,6 +24,7 @@ from torchchain.theory.ladder import (
     Stretch,
     Waves,
     coherent_energy,
+    fading,
     line,
     mirrored,
     spectrum_edges,
@@ -112,9 +113,8 @@ def mean_wave_energy(law: Law, waves: Waves, times: Tensor) -> tuple[Tensor, Ten
         if bool(inside.any()):  # by one grid, whatever times are asked for
             found = _energies(law, waves, times[inside], _stretch(start, stop, edge), edge + _BEYOND)
             medium[:, inside], exact[:, inside] = found
-    gone = (2 * times / LAST - 1).clamp(0, 1)
     medium[:, times > LAST] = exact[:, times > LAST] = 0
-    return medium, medium + (exact - medium) * (1 - gone.square() * (3 - 2 * gone))
+    return medium, medium + (exact - medium) * fading(times, LAST)
 
 
 def _stretch(start: float, stop: float, edge: float) -> Stretch:

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain import BOUNDARIES, CONTACTS, Disorder
 from torchchain.energy.bands import center_tones, check_bands
-from torchchain.theory.crossed import LAST, crossed_transfer, fading
-from torchchain.theory.ladder import DECAY, Waves, ladder_transfer, spectrum_edges, stretches
+from torchchain.theory.crossed import LAST, crossed_transfer
+from torchchain.theory.ladder import DECAY, Waves, fading, ladder_transfer, spectrum_edges, stretches
 from torchchain.theory.law import Law, law_of
 from torchchain.theory.localized import (
     MEASURED,
@@ -151,6 +151,7 @@ def transfer_of_law(
         sharp = localization and 1 < len(law.values) <= MOST_VALUES and isinstance(waves.ring, int)
         if sharp:
             medium, exact = mean_wave_energy(law, waves, times)
+        fade = fading(times, LAST)
         for s, (plain, pattern, change, doubt, first) in enumerate(_returns(law, waves, times, edges[0], numbers)):
             if bool(late.any()):
                 mean[s, late] = _faded(
@@ -158,7 +159,7 @@ def transfer_of_law(
                 )
             error[s] = doubt
             if localization:
-                part = crossed_part(mean[s], crossed[s], first * fading(times), numbers)
+                part = crossed_part(mean[s], crossed[s], first * fade, numbers)
                 mean[s] += part[:, None] * crossed[s] + (1 - part)[:, None] * change
                 if sharp:
                     _exchange(mean[s], int(waves.source_bands[s]), medium[s] + part * coherent[s], exact[s])
