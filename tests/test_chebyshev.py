@@ -12,6 +12,7 @@ from scipy import special
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
 from torchchain.ensemble import fused
+from torchchain.ensemble.observables import is_fused
 from torchchain.evolvers import chebyshev, coefficients, start
 
 BOUNDARIES = ("fixed", "periodic")
@@ -466,6 +467,36 @@ def test_bands(boundary, stiffness, definition, compiled):
             bands = fused.band_energy(chain, state, times, 8, normalize, definition, compiled=compiled)
             assert bands.shape == (3, 3, len(times), 8)
             assert (bands - expected).abs().max() < 1e-11 * expected.abs().max()
+
+
+@pytest.mark.parametrize("compiled", IMPLEMENTATIONS)
+def test_bands_after_a_release_and_after_a_kick(compiled):
+    chain = a_chain("periodic", stiffness=0)
+    shape = a_start("tones", chain).displacement + 0.3  # as velocities, a motion of the ring as a whole
+    released, struck = tc.State(shape, torch.zeros_like(shape)), tc.State(torch.zeros_like(shape), shape)
+    for times in GRIDS.values():
+        found = fused.both_band_energies(chain, released, times, 8, compiled=compiled)
+        for bands, state in zip(found, (released, struck), strict=True):
+            expected = tc.band_energy(chain, tc.evolve(chain, state, times, "modes"), 8)
+            assert bands.shape == (3, 3, len(times), 8)
+            assert (bands - expected).abs().max() < 1e-11
+
+
+def test_starts_are_measured_in_the_kernels_where_rings_are_uniform():
+    """The same as from the states, which rings of unlike contacts leave behind."""
+    scene = tc.Scene(
+        n_particles=48,
+        n_bands=8,
+        realizations=3,
+        times=[0.0, 2.0, 30.0],
+        observables=("band_energy", "kicked_band_energy"),
+    )
+    assert is_fused("chebyshev", scene)
+    assert not is_fused("chebyshev", replace(scene, stiffness_disorder=tc.Disorder("gamma", 0.1)))
+    assert not is_fused("chebyshev", replace(scene, boundary="fixed"))
+    found, expected = (tc.simulate(scene, method) for method in ("chebyshev", "modes"))
+    for name in scene.observables:
+        assert abs(found[name] - expected[name]).max() < 1e-10
 
 
 def test_bands_in_small_pieces(monkeypatch):

@@ -18,7 +18,7 @@ from torchchain.energy.modal_bands import modal_band_energy
 from torchchain.ensemble import fused
 from torchchain.ensemble.layout import Layout
 from torchchain.ensemble.moving_part import MovingPart, PartExceeded
-from torchchain.ensemble.observables import Observable, chosen_observables
+from torchchain.ensemble.observables import MOMENTS, Observable, chosen_observables
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.stages import Stages
 from torchchain.evolvers import start
@@ -81,7 +81,9 @@ class Chunk:
             return self._of_states(entries)
         if self.method == "chebyshev" and kinds == {"bands"}:
             return self._by_kernel(entries, self._bands_by_kernel)
-        if self.method == "chebyshev" and None not in kinds and "bands" not in kinds:
+        if self.layout.fused and "kicked_bands" in kinds:
+            return self._by_kernel(entries, self._kicks_by_kernel)
+        if self.method == "chebyshev" and kinds <= MOMENTS:
             return self._by_kernel(entries, self._moments_by_kernel)
         if self.method == "modes" and kinds == {"bands"} and self.scene.energy_definition == "site":
             bands = self._bands_by_modes()
@@ -112,6 +114,10 @@ class Chunk:
         n_bands, definition = self.scene.n_bands, self.scene.energy_definition
         given = self._chain, self.state, self.times, n_bands, True, definition
         return {"bands": fused.band_energy(*given, **self.options)}
+
+    def _kicks_by_kernel(self) -> dict[str, Tensor]:
+        given = self._chain, self.state, self.times, self.scene.n_bands
+        return dict(zip(("bands", "kicked_bands"), fused.both_band_energies(*given, **self.options), strict=True))
 
     def _moments_by_kernel(self) -> dict[str, Tensor]:
         given = self._chain, self.state, self.times, self.scene.energy_definition

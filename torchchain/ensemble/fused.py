@@ -23,6 +23,7 @@ from torchchain.chain.states import State
 from torchchain.energy import space as energy
 from torchchain.energy import wavenumber
 from torchchain.energy.bands import check_bands
+from torchchain.energy.kicked import kicked_band_energy
 from torchchain.evolvers import start
 from torchchain.evolvers.chebyshev import CompiledAdvance
 from torchchain.evolvers.expansion import ROUNDING
@@ -130,18 +131,77 @@ def band_energy(
         )
     from torchchain.evolvers import stencil
 
-    advance.check_work(times)
-    n, steps, rows = chain.n_particles, times.double().numpy(), advance.rows
-    kind, count = stencil.BOND_FIELDS, 2
-    strain = np.zeros(n // 2 + 1)
+    kind, count, strain = stencil.BOND_FIELDS, 2, np.zeros(chain.n_particles // 2 + 1)
     if definition == "site":
         kind, count = (stencil.UNIFORM_FIELDS, 3) if chain.is_uniform_ring else (stencil.SITE_FIELDS, 4)
-        strain += rows.contacts[0, 0] * 4 * np.sin(math.pi / n * np.arange(n // 2 + 1)) ** 2
+        strain = _strain(chain)
+    (bands,) = _binned(advance, state, times, n_bands, normalize, kind, count, [(kind, strain)])
+    return bands
+
+
+def both_band_energies(
+    chain: Chain, state: State, times: Any, n_bands: int = 32, **options: Any
+) -> tuple[Tensor, Tensor]:
+    """Shares of the energy in bands after a release, and after a kick of the same shape, at every output time.
+
+    What :func:`band_energy` gives, and :func:`torchchain.energy.kicked_band_energy` from the same motion.
+
+    Args:
+        chain: a uniform ring, undamped, masses (*batch, particle).
+        state: at rest, (*batch, *any, particle).
+        times, n_bands, options: see :func:`band_energy`.
+
+    Returns:
+        Two of (*batch, *any, time, band), dtype and device of the state.
+    """
+    check_bands(chain.n_particles, n_bands)
+    times = checks.times("times", times)
+    advance = start(chain, state, "chebyshev", **{"accuracy": ROUNDING, **options})
+    if not isinstance(advance, CompiledAdvance):
+        parts = [
+            (wavenumber.band_energy(chain, here, n_bands), kicked_band_energy(chain, here, n_bands))
+            for here in map(advance, _windows(times, state))
+        ]
+        released, struck = (torch.cat(part, dim=-2) for part in zip(*parts, strict=True))
+        return released, struck
+    from torchchain.evolvers import stencil
+
+    strain = _strain(chain)
+    softness = np.divide(1.0, strain, out=np.zeros_like(strain), where=strain > 0)
+    wanted = [(stencil.UNIFORM_FIELDS, strain), (stencil.KICKED_FIELDS, softness)]
+    released, struck = _binned(advance, state, times, n_bands, True, stencil.KICKED_FIELDS, 4, wanted)
+    return released, struck
+
+
+def _strain(chain: Chain) -> np.ndarray:
+    """Stiffness 4 kappa sin^2(k / 2) of each wavenumber, (N/2 + 1,), of a uniform ring of even N."""
+    n = chain.n_particles
+    return float(chain.contact_stiffness.flatten()[0]) * 4 * np.sin(math.pi / n * np.arange(n // 2 + 1)) ** 2
+
+
+def _binned(
+    advance: CompiledAdvance, state: State, times: Tensor, n_bands: int, normalize: bool, kind: int, count: int,
+    wanted: list[tuple[int, np.ndarray]],
+) -> list[Tensor]:  # fmt: skip
+    """Energies in bands, (*batch, *any, time, band), of each of the wanted kinds.
+
+    Args:
+        advance: from the state at time 0.
+        state, times, n_bands, normalize: see :func:`band_energy`.
+        kind, count: of the fields that are transformed.
+        wanted: kinds of energy with their strain, as :func:`torchchain.evolvers.spectra.bin_spectra` takes them.
+    """
+    from torchchain.evolvers import stencil
+
+    advance.check_work(times)
+    steps, rows = times.double().numpy(), advance.rows
+    n = rows.masses.shape[1]
     window = min(len(steps), max(1, _BLOCK // (8 * n)))
     size = min(rows.count, max(1, _BLOCK // (8 * n * window)))
-    strain = np.repeat(strain, 2)  # of the real and of the imaginary part
+    strains = [np.repeat(strain, 2) for _, strain in wanted]  # of the real and of the imaginary part
     rows_in_time = stencil.Propagation(rows, mirrored=True, once=window == len(steps))
-    bands, totals = np.empty((rows.count, len(steps), n_bands)), np.empty((rows.count, len(steps)))
+    bands = [np.empty((rows.count, len(steps), n_bands)) for _ in wanted]
+    totals = [np.empty((rows.count, len(steps))) for _ in wanted]
 
     def work(part: tuple[int, int]) -> None:
         # Little Python a block: a thread that waits for another's is slow to wake.
@@ -155,17 +215,19 @@ def band_energy(
                     fields = torch.empty((count, high - low, last - first, n), dtype=torch.float64)
                 rows_in_time.fields(low, high, steps[first:last], kind, fields.numpy(), low)
                 spectra = torch.fft.rfft(fields).numpy().view(np.float64)
-                stencil.bin_spectra(spectra, kind, strain, normalize, low, first, bands, totals)
+                for (what, _), strain, found, total in zip(wanted, strains, bands, totals, strict=True):
+                    stencil.bin_spectra(spectra, what, strain, normalize, low, first, found, total)
                 del spectra  # so that the next lie where these do, in cache
 
     workers = min(torch.get_num_threads(), rows.count)
     for _ in map_in_order(work, ranges(rows.count, workers), workers):
         pass
     shape = (*state.displacement.shape[:-1], len(steps))
-    if normalize and not (totals > 0).all():
-        total = torch.from_numpy(totals).reshape(shape)
-        checks.first_bad("total energy", "be positive to normalize", total, ~(total > 0), "time")
-    return torch.from_numpy(bands).reshape(*shape, n_bands).to(state.displacement.dtype)
+    for each in totals if normalize else []:
+        if not (each > 0).all():
+            total = torch.from_numpy(each).reshape(shape)
+            checks.first_bad("total energy", "be positive to normalize", total, ~(total > 0), "time")
+    return [torch.from_numpy(found).reshape(*shape, n_bands).to(state.displacement.dtype) for found in bands]
 
 
 def _windows(times: Tensor, state: State) -> Iterator[Tensor]:

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 AXES = ("time", "particle", "wavenumber", "band", "ring", "species")
 CHAINS, LATTICES, MIXTURES = ("chain",), ("lattice",), ("mixture",)
-KERNELS = ("bands", "total", "center", "width")
+BANDS, MOMENTS = {"bands", "kicked_bands"}, {"total", "center", "width"}
+KERNELS = (*sorted(BANDS), *sorted(MOMENTS))
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,8 @@ class Observable:
         bands: whether it needs ``n_bands``.
         damped: whether damped chains have it.
         passes: elementwise passes over a state that computing it takes, for the plan's estimate of time.
-        kernel: what the stencil's kernels measure it as without storing states: "bands", or "total", "center" or
-            "width" of the energy, which come together.
+        kernel: what the stencil's kernels measure it as without storing states: "bands", of uniform rings "kicked_bands"
+            with them, or "total", "center" or "width" of the energy, which come together.
         kinds: of scenes that have it: of a "chain", of a "lattice", of a "mixture" of species.
 
     Example:
@@ -213,7 +214,7 @@ for _one in (
     ),
     Observable(
         "kicked_band_energy", ("time", "band"), "1", "share of the energy in a band, had the standing wave been one of velocity",
-        _kicked_band_energy, wavenumbers=True, bands=True, damped=False, passes=30, kinds=CHAINS,
+        _kicked_band_energy, wavenumbers=True, bands=True, damped=False, passes=30, kernel="kicked_bands", kinds=CHAINS,
     ),
     Observable("dissipated", ("time",), _JOULE, "energy lost to contact damping so far", _dissipated, passes=0),
     Observable("energy", ("time", "particle"), _JOULE, "energy per particle", _energy, local=True, passes=16),
@@ -270,9 +271,17 @@ def chosen_observables(names: Sequence[str]) -> list[Observable]:
 def is_fused(method: str, scene: Scene) -> bool:
     """Whether the stencil's kernels measure all that is measured in time: the bands of all beads, or totals, centers and widths."""
     kinds = {entry.kernel for entry in chosen_observables(scene.observables) if entry.in_time}
+    if method != "chebyshev" or scene.lattice is not None or scene.by_species:
+        return False
+    return kinds == {"bands"} or kinds <= MOMENTS or (kinds <= BANDS and _has_uniform_rings(scene))
+
+
+def _has_uniform_rings(scene: Scene) -> bool:
+    """Whether standing waves run on rings of equal contacts, whose energy is counted by sites."""
     return (
-        method == "chebyshev"
-        and scene.lattice is None
-        and not scene.by_species
-        and (kinds == {"bands"} or kinds <= {"total", "center", "width"})
+        scene.boundary == "periodic"
+        and scene.stiffness_disorder is None
+        and not scene.species
+        and scene.energy_definition == "site"
+        and isinstance(scene.excitation, StandingWave)
     )

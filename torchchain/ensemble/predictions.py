@@ -335,6 +335,7 @@ def _chebyshev(facts: Facts, accuracy: float) -> float:
     seconds += whole_chain * START * (0.75 + 0.25 * facts.rows)
     if not fused:
         return seconds + points * facts.n * 2 * PASS + _observing(facts)
-    if facts.bands_alone:
-        return seconds + points * facts.n * TRANSFORM
-    return seconds + points * size * MOMENT * any(observable.in_time for observable in facts.observables)
+    measured = [entry for entry in facts.observables if entry.in_time]
+    if any(entry.bands for entry in measured):
+        return seconds + points * facts.n * TRANSFORM * (4 / 3 if len(measured) > 1 else 1)  # of four fields, not three
+    return seconds + points * size * MOMENT * bool(measured)

@@ -10,7 +10,7 @@ import numpy as np
 from torchchain.evolvers.compiling import U, kernel, summing_kernel, wide_vectors
 
 # States; sums over particles of energy; the fields whose transforms make the energy of a wavenumber.
-STATES, SITE_MOMENTS, BOND_MOMENTS, UNIFORM_FIELDS, SITE_FIELDS, BOND_FIELDS = range(6)
+STATES, SITE_MOMENTS, BOND_MOMENTS, UNIFORM_FIELDS, SITE_FIELDS, BOND_FIELDS, KICKED_FIELDS = range(7)
 
 
 @summing_kernel
@@ -126,10 +126,16 @@ def record_fields(w, row, u, v, kind, moved, out, r, i):
         for q in range(n):
             displacement[q] = w[p + q]
         return
+    if kind == KICKED_FIELDS:  # velocities after a kick, of which the motion as a whole is one
+        moved = 0.0
     for q in range(n):
         displacement[q] = w[p + q] - moved
     for q in range(n):
         second[q] = w[b + q] * w[s + q]
+    if kind == KICKED_FIELDS:
+        momentum = out[3, r, i]
+        for q in range(n):
+            momentum[q] = w[b + q] * w[p + q]
     if kind == SITE_FIELDS:
         pull = out[3, r, i]
         for q in range(n):

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchchain.evolvers.compiling import U, summing_kernel, wide_vectors
-from torchchain.evolvers.records import SITE_FIELDS, UNIFORM_FIELDS
+from torchchain.evolvers.records import KICKED_FIELDS, SITE_FIELDS, UNIFORM_FIELDS
 
 
 @summing_kernel
@@ -16,8 +16,10 @@ def bin_spectra(spectra, kind, strain, normalize, row, time, bands, totals):
     Args:
         spectra: transforms of the fields that :func:`propagate` leaves, without a factor, (field, row, time,
             2 (N/2 + 1)): the real and the imaginary part of each wavenumber in turn.
-        kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS.
-        strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, twice for each wavenumber, (2 (N/2 + 1),).
+        kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS; KICKED_FIELDS for the motion after a kick, of which these are the
+            fields of the motion after a release (see :mod:`torchchain.energy.kicked`).
+        strain: stiffness 4 kappa sin^2(k / 2) of a uniform ring, twice for each wavenumber, (2 (N/2 + 1),); of KICKED_FIELDS
+            its inverse, 0 at k = 0.
         normalize: divide by the total.
         row, time: where in the results the spectra belong.
         bands: (row, time, band), written.
@@ -37,6 +39,9 @@ def bin_spectra(spectra, kind, strain, normalize, row, time, bands, totals):
             if kind == UNIFORM_FIELDS:
                 for k in range(size):
                     energy[k] = p[k] * q[k] + strain[k] * s[k] * s[k]
+            elif kind == KICKED_FIELDS:
+                for k in range(size):
+                    energy[k] = s[k] * t[k] + strain[k] * q[k] * q[k]
             elif kind == SITE_FIELDS:
                 for k in range(size):
                     energy[k] = p[k] * q[k] + s[k] * t[k]

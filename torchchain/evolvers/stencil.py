@@ -37,6 +37,7 @@ from torchchain.evolvers.expansion import LEAP, LONGEST, SHARED_PHASE
 from torchchain.evolvers.records import (
     BOND_FIELDS,
     BOND_MOMENTS,
+    KICKED_FIELDS,
     SITE_FIELDS,
     SITE_MOMENTS,
     STATES,
@@ -49,8 +50,8 @@ from torchchain.evolvers.recursion import PAD, RING, Row, advance, aligned, clea
 from torchchain.evolvers.spectra import bin_spectra
 
 __all__ = [
-    "BOND_FIELDS", "BOND_MOMENTS", "SITE_FIELDS", "SITE_MOMENTS", "STATES", "UNIFORM_FIELDS", "Propagation", "Rows",
-    "bin_spectra", "propagate", "squared_bounds",
+    "BOND_FIELDS", "BOND_MOMENTS", "KICKED_FIELDS", "SITE_FIELDS", "SITE_MOMENTS", "STATES", "UNIFORM_FIELDS", "Propagation",
+    "Rows", "bin_spectra", "propagate", "squared_bounds",
 ]  # fmt: skip
 
 # The mirrored form adds up rounding errors like a random walk's integral; a plain step now and then ends that.
@@ -87,7 +88,7 @@ def propagate(
         mirrored: use the states mirrored about an anchor where the times form a uniform grid, and take times that
             are equal within rounding as equal. Without it the states do not depend on how the times are cut into
             calls, to the last bit.
-        kind: STATES to BOND_FIELDS.
+        kind: STATES to KICKED_FIELDS.
         anchors, latest: states (row, 2, particle) at the last anchor and at the last time, updated unless ``latest``
             is empty, when these times are the only ones.
         clock: (row, 4): time of the anchor, times since it, last time, and twice the energy at the start (negative
