@@ -274,7 +274,7 @@ def fit_points(
     if distance is None:
         distance = 0.01 * (mean - torch.eye(len(mean), dtype=mean.dtype)[:, None]).abs().sum(-1).mean(0) / 2
     spread = distance[picked].double()
-    spread = spread.clamp(min=max(1e-5 * float(spread.max()), 1e-300))
+    spread = spread.clamp(min=max(1e-9 * float(spread.max()), 1e-300))
     times, data = times[picked], mean[:, picked]
     if long_time is not None:
         # of what has not settled by the end, a share of 1 / t may be left: no time beyond the data is without a tie

@@ -305,7 +305,7 @@ def _in_bands(mean: Tensor) -> Tensor:
 def _weights(stderr: Tensor) -> Tensor:
     """Inverse of the error of each energy, (source, time), from the standard errors (source, time, band)."""
     distance = statistical_distance(stderr)
-    distance = distance.clamp(min=max(1e-5 * float(distance.max()), 1e-300))
+    distance = distance.clamp(min=max(1e-9 * float(distance.max()), 1e-300))
     mean = distance.mean(0) ** (1 - EVENNESS) * distance**EVENNESS
     return stderr.shape[-1] / math.sqrt(math.pi) / mean
 
