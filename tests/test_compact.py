@@ -271,19 +271,40 @@ def test_family_predicts_a_strength_between():
         family.at(0.5)
 
 
-def test_a_family_keeps_what_the_theory_says_of_its_members(monkeypatch):
+def test_a_family_keeps_what_the_theory_says_of_its_members(monkeypatch, tmp_path):
     fitted_now = []
-    monkeypatch.setattr(
-        compact_family, "_fitted", lambda *given: fitted_now.append(given) or torch.zeros(n_coefficients(DEGREES))
-    )
-    monkeypatch.setattr(compact_family, "_guides", {})
+    fitted = compact_family._fitted
+    monkeypatch.setattr(compact_family, "_fitted", lambda *given: fitted_now.append(given[0]) or fitted(*given))
+    own = [tc.band_transfer(scene(strength, realizations=20), starts=False) for strength in (0.2, 0.4)]
+    family = tc.MasterFamily(calibrate_together(own, (0.5, 2.0), 4, DEGREES, 2))
+    assert [each.disorder.strength for each in fitted_now] == [0.2, 0.4]
+    family.save(tmp_path / "family.safetensors")
+    again = tc.MasterFamily.load(tmp_path / "family.safetensors")
+    for each in (family, again):
+        for strength in (0.3, 0.31, 0.3):
+            each.at(strength)
+    assert [each.disorder.strength for each in fitted_now[2:]] == [0.3, 0.31, 0.3, 0.31]
+    times = own[0].times
+    for name in ("transfer", "standard_error"):
+        one, two = (
+            each.at(0.3).transfer(times) if name == "transfer" else each.at(0.3).uncertainty.stderr
+            for each in (family, again)
+        )
+        assert torch.equal(one, two)
+
+
+def test_a_member_of_old_files_without_the_theory_is_told_it_again(monkeypatch):
     members = []
     for strength in (0.2, 0.4):
         record = Calibration("logistic", "compact", (0.5, 2.0), scene(strength), Report())
         members.append(MasterEquation(random_model(strength=strength, size=0.1), record))
-    for strength in (0.3, 0.31, 0.3):
-        compact_family.between(members, scene(strength), 2)
-    assert [given[0].disorder.strength for given in fitted_now] == [0.3, 0.2, 0.4, 0.31]
+    guide = compact_family._guide(scene(0.2), DEGREES)
+    told = compact_family.between(members, scene(0.3), 2)
+    held = members[0].model
+    members[0] = MasterEquation(CompactModel(**held.tensors() | {"guide": guide}), members[0].calibration)
+    assert torch.equal(compact_family.between(members, scene(0.3), 2).coefficients, told.coefficients)
+    with pytest.raises(FieldError, match="guide must have shape"):
+        CompactModel(**held.tensors() | {"guide": guide[:-1]})
 
 
 def test_a_family_is_small_and_near_at_unseen_strengths():

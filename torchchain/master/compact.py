@@ -97,20 +97,22 @@ class CompactModel(TransferModel):
         waves: as tensors of :class:`Waves`.
         loss: of damped chains, weight of modes in what is left of the energy of each source, (band, mode); else (band, 0).
         contact_damping: of a contact of stiffness 1.
+        guide: of members of a family, what the theory of disorder says of the coefficients, (term,); else (0,).
     """
 
     kind: ClassVar[str] = "compact"
     axes: ClassVar[dict[str, tuple[str, ...]]] = {
         "rates": ("band", "band"), "degrees": ("degree",), "coefficients": ("term",), "source_frequency": ("band",),
         "source_decay": ("band",), "tone_frequency": ("band", "tone"), "tone_decay": ("band", "tone"), "coupling": (),
-        "loss": ("band", "mode"), "contact_damping": (),
+        "loss": ("band", "mode"), "contact_damping": (), "guide": ("term",),
     }  # fmt: skip
+    optional: ClassVar[tuple[str, ...]] = ("guide",)
     rates_meaning: ClassVar[str] = MemoryModel.rates_meaning
 
     def __init__(
         self, rates: Tensor, degrees: Tensor, coefficients: Tensor, source_frequency: Tensor, source_decay: Tensor,
         tone_frequency: Tensor, tone_decay: Tensor, coupling: Tensor, loss: Tensor | None = None,
-        contact_damping: Tensor | None = None,
+        contact_damping: Tensor | None = None, guide: Tensor | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         rates = checks.real_tensor("rates", rates)
@@ -147,6 +149,10 @@ class CompactModel(TransferModel):
             raise checks.fail(
                 "contact_damping", "be a number, above 0 with a loss and 0 without", contact_damping.tolist()
             )
+        guide = checks.real_tensor("guide", rates.new_zeros(0) if guide is None else guide).to(rates)
+        if tuple(guide.shape) not in ((0,), tuple(self.coefficients.shape)):
+            raise checks.fail("guide", f"have shape {tuple(self.coefficients.shape)}", f"shape {tuple(guide.shape)}")
+        self.register_buffer("guide", guide.detach().clone())
         self.register_buffer("loss", loss.detach().clone())
         self.register_buffer("contact_damping", contact_damping.detach().clone())
         self.loss: Tensor
@@ -157,6 +163,7 @@ class CompactModel(TransferModel):
         self.tone_decay: Tensor
         self.coupling: Tensor
         self.coefficients: Tensor
+        self.guide: Tensor
         place, own = shapes(self.waves, self.degrees_)
         self._place, self._own = place, own  # not part of the file: they follow from the waves
 
@@ -213,6 +220,7 @@ class CompactModel(TransferModel):
             "loss": self.loss,
             "contact_damping": self.contact_damping,
             **self.waves.tensors(),
+            **({"guide": self.guide} if len(self.guide) else {}),
         }
 
     def _apply(self, fn: Any, recurse: bool = True) -> CompactModel:

@@ -59,8 +59,6 @@ LEAST = 1e-12
 WEAKEST = 1e-9
 """In place of no disorder, where nothing moves."""
 
-MOST_KEPT = 32
-"""Sets of the theory's coefficients that are kept: one for each member of a family, and for strengths that were asked for."""
 THEORY_WEAKEST = 1e-3
 """Weakest disorder of which the theory is asked for coefficients: the energy that leaves a band, some xi^2, nears rounding."""
 
@@ -83,16 +81,25 @@ def weights(strength: float, known: Sequence[float], sets: int) -> np.ndarray:
     return polynomials_of([strength], known, sets)[0] @ np.linalg.pinv(polynomials_of(known, known, sets))
 
 
-def between(members: Sequence[MasterEquation], scene: Scene, sets: int, power: int = 2) -> CompactModel:
+def between(
+    members: Sequence[MasterEquation], scene: Scene, sets: int, power: int = 2, guide: Tensor | None = None
+) -> CompactModel:
     """The model of a scene whose strength may lie between those of members that were fitted together.
 
     Where the theory of disorder describes the chains, it is what the coefficients differ from it by that is a polynomial; below
     the lowest strength see :func:`_below`. Elsewhere they go to zero below the lowest as xi^2, for D is perturbation theory,
     exact in that limit, and what it leaves out is of order xi^2 t. What damped chains have left is a mixture of that of the nearest two strengths.
+
+    Args:
+        members: in order of their strengths.
+        scene: of which a model is wanted.
+        sets: polynomials of sqrt(xi).
+        power: of xi, by which what a model leaves out falls below the lowest strength.
+        guide: what the theory says of the scene, where it is known.
     """
     known = [member.calibration.strength or WEAKEST for member in members]
     strength = max(scene.disorder.strength, WEAKEST)
-    tensors = [member.model.tensors() for member in members]
+    tensors = [{name: x for name, x in member.model.tensors().items() if name != "guide"} for member in members]
 
     def summed(name: str, shares: Sequence[float]) -> Tensor:
         return torch.stack([share * each[name].double() for share, each in zip(shares, tensors, strict=True)]).sum(0)
@@ -113,9 +120,10 @@ def between(members: Sequence[MasterEquation], scene: Scene, sets: int, power: i
         mixed["coefficients"] = summed("coefficients", near) * fewer ** (power / 2) * (strength / told) ** power
     else:
         shares = weights(strength, known, sets).tolist()
-        mixed["coefficients"] = _guide(_at(scene, strength), degrees) + summed("coefficients", shares)
-        for share, xi in zip(shares, known, strict=True):
-            mixed["coefficients"] = mixed["coefficients"] - share * _guide(_at(scene, xi), degrees)
+        mixed["guide"] = _guide(scene, degrees) if guide is None else guide
+        mixed["coefficients"] = mixed["guide"] + summed("coefficients", shares)
+        for share, member in zip(shares, members, strict=True):
+            mixed["coefficients"] = mixed["coefficients"] - share * _known_guide(member, degrees)
     return CompactModel(**tensors[0] | mixed | waves.tensors())
 
 
@@ -159,19 +167,20 @@ def _odds(transfer: Tensor) -> Tensor:
     return transfer / transfer.diagonal(dim1=0, dim2=2).T[..., None]
 
 
-_guides: dict[Any, Tensor] = {}
-
-
 def _guide(scene: Scene, degrees: tuple[int, int, int]) -> Tensor:
     """Coefficients of the compact form for what the theory of disorder says of a scene's chains; zero if nothing."""
     if not _described(scene):
         return torch.zeros(n_coefficients(degrees), dtype=torch.float64)
-    theory = TheoryModel.of(scene)
-    if (theory.ring, degrees) not in _guides:
-        while len(_guides) >= MOST_KEPT:
-            _guides.pop(next(iter(_guides)), None)
-        _guides[theory.ring, degrees] = _fitted(scene, derived(theory.ring, _fit_times()), degrees)
-    return _guides[theory.ring, degrees]
+    return _fitted(scene, derived(TheoryModel.of(scene).ring, _fit_times()), degrees)
+
+
+def _known_guide(member: MasterEquation, degrees: tuple[int, int, int]) -> Tensor:
+    """That of a member's chains, which it holds if it was fitted in a family with these degrees."""
+    model, scene = member.model, member.calibration.scene
+    if isinstance(model, CompactModel) and len(model.guide) and model.degrees_ == degrees:
+        return model.guide
+    assert scene is not None, "a family's constructor has checked it"
+    return _guide(scene, degrees)
 
 
 def _fit_times() -> Tensor:
@@ -196,18 +205,18 @@ def nearest(strength: float, known: Sequence[float]) -> list[float]:
 
 
 def fit_together(
-    samples: Sequence[Sample], degrees: tuple[int, int, int] = DEGREES, sets: int = SETS,
+    samples: Sequence[Sample], guides: np.ndarray, degrees: tuple[int, int, int] = DEGREES, sets: int = SETS,
     progress: Callable[[int], Any] | None = None,
 ) -> tuple[np.ndarray, CompactReport]:  # fmt: skip
     """Coefficients for every sample, (sample, coefficient), and how the regression went.
 
     Args:
         samples: of chains that differ in the strength of their masses' disorder, in order of it.
+        guides: what the theory says of each sample, (sample, coefficient).
         degrees: of the polynomials in place, distance and time.
         sets: polynomials of sqrt(xi), no more than there are samples.
         progress: called with 1 after every step.
     """
-    guides = _guides_of(samples, degrees)
     problems = [regression_of(sample, degrees).guided(guide) for sample, guide in zip(samples, guides, strict=True)]
     mixing = _mixing(samples, sets)
     with single_blas_thread():
@@ -215,12 +224,6 @@ def fit_together(
     return guides + mixing @ found, CompactReport(
         told["converged"], told["steps"], told["misfit"], degrees, mixing.shape[1]
     )
-
-
-def _guides_of(samples: Sequence[Sample], degrees: tuple[int, int, int]) -> np.ndarray:
-    """What the theory says of each sample, (sample, coefficient)."""
-    scenes = [sample.scene for sample in samples]
-    return np.stack([_guide(scene, degrees).numpy() for scene in scenes if scene is not None])
 
 
 def _start(problems: Sequence[Regression], mixing: np.ndarray, progress: Callable[[int], Any] | None) -> np.ndarray:
@@ -265,10 +268,11 @@ def calibrate_together(
     transfers = sorted(transfers, key=lambda transfer: Sample.of(transfer).strength or 0.0)
     degrees = DEGREES if degrees is None else checked_degrees(degrees)
     samples = [Sample.of(transfer) for transfer in transfers]
-    found, told = fit_together(samples, degrees, sets, progress)
+    guides = np.stack([_guide(scene, degrees).numpy() for scene in map(_scene_of, samples)])
+    found, told = fit_together(samples, guides, degrees, sets, progress)
     slopes = [torch.einsum("t,str->sr", linear_weights(s.times, window), s.distribution().mean) for s in samples]
     models = [
-        _model(sample, rates, degrees, row) for sample, rates, row in zip(samples, slopes, found, strict=True)
+        _model(sample, rates, degrees, *rows) for sample, rates, *rows in zip(samples, slopes, found, guides, strict=True)
     ]  # fmt: skip
     errors: list[Uncertainty] | list[None] = [None] * len(models)
     if replicates:
@@ -285,11 +289,17 @@ def calibrate_together(
     ]  # fmt: skip
 
 
-def _model(sample: Sample, rates: Tensor, degrees: tuple[int, int, int], coefficients: np.ndarray) -> CompactModel:
+def _scene_of(sample: Sample) -> Scene:
     assert sample.scene is not None, "check_scene has seen it"
+    return sample.scene
+
+
+def _model(
+    sample: Sample, rates: Tensor, degrees: tuple[int, int, int], coefficients: np.ndarray, guide: np.ndarray
+) -> CompactModel:
     return CompactModel(
         rates=rates, degrees=torch.tensor(degrees, dtype=torch.float64), coefficients=torch.from_numpy(coefficients.copy()),
-        **Waves.of(sample.scene).tensors(), **loss_tensors(sample),
+        guide=torch.from_numpy(guide.copy()), **Waves.of(_scene_of(sample)).tensors(), **loss_tensors(sample),
     )  # fmt: skip
 
 
@@ -300,7 +310,7 @@ def _errors(
     """Error bars of all models: the blocks of every ensemble are drawn again, each time by one step from the solution."""
     repeats = [block_draws(len(transfer.block_counts), replicates, i) for i, transfer in enumerate(transfers)]
     mixing = _mixing(samples, sets)
-    guides = _guides_of(samples, models[0].degrees_)
+    guides = np.stack([model.guide.numpy() for model in models])
     problems = [
         regression_of(sample, models[0].degrees_).guided(guide) for sample, guide in zip(samples, guides, strict=True)
     ]
@@ -318,11 +328,13 @@ def _errors(
 def joined(members: Sequence[MasterEquation]) -> list[MasterEquation]:
     """Models that were calibrated each alone, fitted together to what they predict, weighted by their error bars."""
     degrees = max((m.model.degrees_ for m in members if isinstance(m.model, CompactModel)), key=sum)
+    degrees = min(degrees, DEGREES, key=sum)
     samples = [_seen(member) for member in members]
-    found, told = fit_together(samples, min(degrees, DEGREES, key=sum))
+    guides = np.stack([_known_guide(member, degrees).numpy() for member in members])
+    found, told = fit_together(samples, guides, degrees)
     again = []
-    for member, sample, row in zip(members, samples, found, strict=True):
-        model, errors = _model(sample, member.rates.detach(), told.degrees, row), member.uncertainty
+    for member, sample, row, guide in zip(members, samples, found, guides, strict=True):
+        model, errors = _model(sample, member.rates.detach(), told.degrees, row, guide), member.uncertainty
         if errors is not None:
             before, now = (each.transfer(errors.times).detach() for each in (member.model, model))
             off = model_error(now, before, errors.stderr, errors.stderr)
@@ -374,7 +386,10 @@ def errors_between(
         variance = variance * _shared(_at(scene, known[0]), told, times).square()
     spread = variance.sqrt()
     if strength not in known and sets > 1:
-        lower = _below(members[0], told, times, 1) if guided else between(members, scene, sets - 1, 1).transfer(times)
+        if guided:
+            lower = _below(members[0], told, times, 1)
+        else:
+            lower = between(members, scene, sets - 1, 1, model.guide if len(model.guide) else None).transfer(times)
         spread = (variance + model_error(here, lower.detach(), spread, spread).square()).sqrt()
     return Uncertainty(slopes.sqrt(), bases.sqrt(), times, spread)
 

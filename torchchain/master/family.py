@@ -32,6 +32,8 @@ from torchchain.master.starts import between as between_starts
 from torchchain.master.uncertainty import Uncertainty
 
 NEIGHBORS = 4
+MOST_KEPT = 8
+"""Master equations between the members that a family keeps, the last asked for."""
 
 
 class MasterFamily(Printed):
@@ -73,6 +75,7 @@ class MasterFamily(Printed):
                     "members", "be calibrated on chains of a scene", member.calibration.provenance or "no scene"
                 )
         self.members = tuple(sorted(members, key=lambda member: scene_of(member).disorder.strength))
+        self._kept: dict[float, MasterEquation] = {}
         first = scene_of(self.members[0])
         for member in self.members:
             scene = scene_of(member)
@@ -154,9 +157,12 @@ class MasterFamily(Printed):
         chosen = dict(zip(self.strengths, self.members, strict=True))
         if len(weights) == 1:  # a member's own strength
             return chosen[next(iter(weights))]
-        found = self._joined(float(strength), weights)
-        found.starts = self._starts(scene_of(found))
-        return found
+        strength = float(strength)
+        if strength not in self._kept:
+            found = self._joined(strength, weights)
+            found.starts = self._starts(scene_of(found))
+            self._kept = dict([*self._kept.items(), (strength, found)][-MOST_KEPT:])
+        return self._kept[strength]
 
     def _starts(self, scene: Scene) -> StartModel | None:
         """The model of starts in space from the members on either side; none below the lowest, where it was far off."""

@@ -270,7 +270,8 @@ def _tensors(where: str, file: Any, headers: Sequence[Mapping[str, Any]], form: 
 def _model_tensors(
     where: str, file: Any, header: Mapping[str, Any], prefix: str, names: set[str]
 ) -> dict[str, torch.Tensor]:
-    expected = kinds()[header["kind"]].axes
+    kind = kinds()[header["kind"]]
+    expected = {n: axes for n, axes in kind.axes.items() if n not in kind.optional or prefix + n in names}
     if any(prefix + name in names for name in ERROR_AXES):
         expected = expected | ERROR_AXES
     if any(name.startswith(prefix + STARTS) for name in names):

@@ -45,6 +45,7 @@ class TransferModel(nn.Module):
     Attributes:
         kind: what its files call it.
         axes: of each tensor that makes the model: "band", or any other word for an axis of any length.
+        optional: those of them that a file may lack.
         rates_meaning: what :attr:`rates` are, in words.
 
     Example:
@@ -64,6 +65,7 @@ class TransferModel(nn.Module):
 
     kind: ClassVar[str]
     axes: ClassVar[dict[str, tuple[str, ...]]]
+    optional: ClassVar[tuple[str, ...]] = ()
     rates_meaning: ClassVar[str] = "slope of the model's transfer at time 0"
     basis: Tensor
     damping: Tensor
