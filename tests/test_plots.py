@@ -1,12 +1,15 @@
 """Figures: what is drawn is what was measured, on axes of the caller's or of their own."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
+import torch
 from matplotlib.collections import FillBetweenPolyCollection
 
 import torchchain as tc
 from torchchain import plots
-from torchchain.cli.calibration_figure import sources_of
+from torchchain.cli.calibration_figure import calibration_figure, rates_of, sources_of
 
 WAVE = tc.Scene(
     n_particles=32, boundary="fixed", excitation=tc.Impulse(), observables=("center", "width", "energy"),
@@ -58,6 +61,22 @@ def test_transfer_and_rates(small_transfer, tmp_path):
     for source in (0, 5, 2.5):
         with pytest.raises((tc.FieldError, tc.FieldTypeError), match="source"):
             small_transfer.plot(source)
+
+
+@pytest.mark.parametrize("shown", [(2,), (1, 4)])
+def test_labels_of_a_calibration_have_room(small_transfer, shown):
+    master = tc.calibrate(small_transfer, bootstrap=0)
+    predicted = master.solve(torch.eye(4, dtype=torch.float64), small_transfer.times).detach()
+    figure = calibration_figure(small_transfer, master, predicted, rates_of(small_transfer, master), shown)
+    figure.draw_without_rendering()
+    boxes = [ax.get_tightbbox() for ax in figure.axes]
+    assert len(boxes) == 3 * len(shown) + 3 + 2 * len(shown) + 1
+    for box in boxes:
+        assert box.x0 >= 0
+        assert box.y0 >= 0
+        assert box.x1 <= figure.bbox.x1
+        assert box.y1 <= figure.bbox.y1
+    assert not [(i, j) for i, j in combinations(range(len(boxes)), 2) if boxes[i].overlaps(boxes[j])]
 
 
 def test_style_is_of_the_figure_alone():

@@ -16,6 +16,8 @@ from torchchain.master import MasterEquation
 from torchchain.master.paper_rates import paper_rates
 
 MOST_SHOWN = 6
+ROOM = plots.Room(left=0.45, right=0.06, below=0.85, above=0.22, across=0.98, down=0.94)
+"""For two lines of a legend below each panel, three below the last; labels of colors beside each but the last."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ def calibration_figure(
     times, mean, stderr = transfer.times.numpy(), transfer.mean.numpy(), transfer.stderr.numpy()
     model = predicted.numpy()
     with plots.style():
-        figure, axes = plots.figure(plots.PAGE, 2.2 * len(shown) + 2.4, len(shown) + 1, 3)
+        figure, axes = plots.figure(plots.PAGE, 2.2 * len(shown) + 2.3, len(shown) + 1, 3, ROOM)
         for row, source in zip(axes, shown, strict=False):
             plots.band_map(row[0], times, mean[source - 1], f"chains, source {source}")
             plots.band_map(row[1], times, model[source - 1], f"model, source {source}")
