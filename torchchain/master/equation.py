@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 NEGATIVE_SHARE = 1e-3
+OF_CHAINS_TOO = "energies by site are no squares, and chains on their way to rest have such energies as well"
 """Negative energies of a band up to this share of the total are not worth a warning."""
 GAINED_SHARE = 1e-2
 """Nor is energy that a model makes, up to this share of the total."""
@@ -198,7 +199,7 @@ class MasterEquation(Printed, nn.Module):
                 raise checks.fail("supply", "be None for a start in space", checks.shown(supply))
             with single_thread():
                 energy = self.starts.solve(start, times).to(self.rates)
-            self._warn(start.bands(self.n_bands).to(self.rates), times, None, energy.detach())
+            self._warn(start.bands(self.n_bands).to(self.rates), times, None, energy.detach(), OF_CHAINS_TOO)
             return energy
         if start is not None:
             warnings.warn(
@@ -250,7 +251,10 @@ class MasterEquation(Printed, nn.Module):
             raise checks.fail("supply", f"fit a batch of {tuple(initial.shape[:-1])} starts", f"shape {tuple(supply.shape)}") from None  # fmt: skip
         return supply.expand(*batch, *shape)
 
-    def _warn(self, initial: Tensor, times: Tensor, fed: Tensor | None, energy: Tensor) -> None:
+    def _warn(
+        self, initial: Tensor, times: Tensor, fed: Tensor | None, energy: Tensor,
+        why_negative: str = "the model is that uncertain there",
+    ) -> None:  # fmt: skip
         """The warnings of :meth:`solve`, shown at the line that called it."""
         end = float(times[-1])
         if end > self.horizon * (1 + 1e-9):
@@ -278,7 +282,7 @@ class MasterEquation(Printed, nn.Module):
         lowest = float((energy.amin(-1) / total).min())
         if lowest < -NEGATIVE_SHARE:
             warnings.warn(
-                f"lowest predicted energy of a band is {lowest:.2g} of the total: the model is that uncertain there",
+                f"lowest predicted energy of a band is {lowest:.2g} of the total: {why_negative}",
                 PredictionWarning,
                 stacklevel=3,
             )
