@@ -16,6 +16,7 @@ from torchchain.checks import FieldError, FieldTypeError
 from torchchain.ensemble.plan import ARTIFACT
 from torchchain.master import MasterFamily, PredictionWarning, calibrate_family, chapman_kolmogorov, implied_timescales
 from torchchain.master.calibration import recipe
+from torchchain.master.certificate import certify
 from torchchain.master.model import equal_steps, flows
 from torchchain.master.rates import SwingInModel
 from torchchain.master.sample import Sample, loss_rates
@@ -177,6 +178,44 @@ def test_too_few_blocks_hold_nothing_out():
     assert master.uncertainty is None
 
 
+@pytest.mark.parametrize("realizations", [1, 3])
+@pytest.mark.parametrize(("n_particles", "chosen"), [(32, "compact"), (64, "theory")])
+def test_a_few_chains_are_not_followed_with_thousands_of_numbers(n_particles, chosen, realizations):
+    few, many = (
+        tc.band_transfer(
+            tc.Scene(
+                n_particles=n_particles, n_bands=n_particles // 8, realizations=count, seed=seed, times=TIMES,
+                disorder=tc.Disorder("binary", 0.9),
+            ),
+            starts=False,
+        )
+        for seed, count in ((0, realizations), (1, 100))
+    )  # fmt: skip
+    master = tc.calibrate(few)
+    assert (master.calibration.model, master.n_parameters <= 53) == (chosen, True)
+    assert "fewest fitted numbers: too few blocks" in master.calibration.report.selection.reason
+    off, own = (tc.total_variation(found, many.mean)[:, 1:].mean() for found in (master.transfer(few.times), few.mean))
+    assert float(off) < 0.9 * float(own)  # nearer to the ensemble than these chains are
+    assert certify(master.model).holds
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_is_chosen_for_a_handful_of_chains_is_never_negative(seed):
+    """Models of rates can be: -1e-3 of the energy with seed 0."""
+    scene = tc.Scene(
+        n_particles=32,
+        n_bands=4,
+        realizations=4,
+        seed=seed,
+        disorder=tc.Disorder(strength=0.05),
+        times=np.arange(0, 60, 0.5),
+    )
+    master = tc.calibrate(tc.band_transfer(scene, starts=False), bootstrap=0)
+    times = torch.cat([torch.zeros(1), torch.logspace(-2, 6, 100)]).double()
+    assert float(master.transfer(times).detach().min()) > -1e-12
+    assert master.calibration.report.certificate.holds
+
+
 @pytest.mark.parametrize(("kind", "strength"), [("binary", 0.5), ("binary", 0.9), ("lognormal", 0.7), ("gamma", 0.9)])
 def test_strong_disorder_of_other_kinds(kind, strength):
     """Fresh chains are missed by what two ensembles are apart, within the error bars, and nothing is ever negative."""
@@ -219,7 +258,9 @@ def test_listed_times_choose_as_well_as_times_by_logarithm():
     for times in spaced:
         own = tc.band_transfer(replace(scene, times=times), method="modes", starts=False)
         off = tc.total_variation(tc.calibrate(own, bootstrap=0).model.transfer(seen), fresh.mean).mean(0)
-        ensembles = tc.statistical_distance(fresh.stderr).mean(0) * math.sqrt((1 + 100 / 40) / 2)  # of 40 and of 100 chains
+        ensembles = tc.statistical_distance(fresh.stderr).mean(0) * math.sqrt(
+            (1 + 100 / 40) / 2
+        )  # of 40 and of 100 chains
         assert all(float(off[part].mean()) < 1.5 * float(ensembles[part].mean()) for part in (seen <= 8, seen > 8))
 
 

@@ -13,6 +13,7 @@ from torchchain import checks
 from torchchain.ensemble.measured_transfer import with_late_average
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.certificate import certify
 from torchchain.master.certified import certified
 from torchchain.master.compact import CompactModel
 from torchchain.master.derived import TheoryModel
@@ -179,10 +180,14 @@ def calibrate(
             fitted, told, proof = certified(
                 transfer, asked, (fitted, told), report.selection is not None, shown.update, spare is not None
             )
-            if proof is None and spare is not None:
-                asked = spare  # nothing that may be negative is handed out where another can be had
-                fitted, told = asked.run(sample, None, shown.update)
-                free = fitted
+        elif isinstance(fitted, RateModel) and report.selection is not None and not sample.damped:
+            proof = certify(fitted)
+            proof = proof if proof.holds else None
+        sure = proof is not None or (asked.model is not None and asked.model.never_negative)
+        if not sure and spare is not None:
+            asked = spare  # nothing that may be negative is handed out where another can be had
+            fitted, told = asked.run(sample, None, shown.update)
+            free, proof = fitted, None
         report = replace(
             report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=count,
             certificate=fitted.certificate if isinstance(fitted, CompactModel | TheoryModel) else proof,

@@ -90,12 +90,13 @@ def select(
 
     Returns:
         The recipe of the rung, what was tried, the model fitted to half of the blocks, and of the rungs that were tried the
-        nearest whose energies are never negative by its form.
+        nearest whose energies are never negative by its form; if there was none, the smallest of those that were not tried.
     """
     candidates = rungs(asked, transfer)
     blocks = len(transfer.block_counts)
     if blocks < 4:
-        return _untested(candidates), Selection("largest: too few blocks of realizations to hold some out"), None, None
+        untested, reason = _untested(candidates)
+        return untested, Selection(f"{reason}: too few blocks of realizations to hold some out"), None, None
     even = (torch.arange(blocks) + 1) % 2
     parts = Sample.of_blocks(transfer, even), Sample.of_blocks(transfer, 1 - even)
     seen = kept_times(transfer.times, SEEN)
@@ -181,7 +182,8 @@ def select(
     reached = "reaches" if enough else "comes nearest to"
     reason = f"smallest model that {reached} the distance of the two halves of the ensemble"
     sure = [i for i, rung in enumerate(tried) if MODELS[rung.model].never_negative]
-    spare = chosen[min(sure, key=lambda i: tried[i].distance)] if sure else None
+    untried = next((candidate for candidate in candidates if _model(candidate).never_negative), None)
+    spare = chosen[min(sure, key=lambda i: tried[i].distance)] if sure else untried
     return chosen[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best], spare
 
 
@@ -200,10 +202,16 @@ def foreseen(halves: Tensor, missed: Tensor, spread: Tensor) -> Tensor:
     return ((missed.square() - (squared + spread.square()) / 4).clamp(min=0) / (squared / 2).clamp(min=1e-300)).sqrt()
 
 
-def _untested(candidates: list[Recipe]) -> Recipe:
-    """The last of those without windows, that none has to be tested in; else the last."""
-    plain = [candidate for candidate in candidates if candidate.model is None or not candidate.model.windows]
-    return (plain or candidates)[-1]
+def _untested(candidates: list[Recipe]) -> tuple[Recipe, str]:
+    """Of those never negative the one of the fewest fitted numbers; else the largest without windows to be tested in; and why.
+
+    A few chains are so far from their ensemble that what follows them follows noise.
+    """
+    sure = [candidate for candidate in candidates if _model(candidate).never_negative]
+    if sure:
+        return sure[0], "fewest fitted numbers"
+    plain = [candidate for candidate in candidates if not _model(candidate).windows]
+    return (plain or candidates)[-1], "largest"
 
 
 def windows(times: Tensor, ends: tuple[float, ...]) -> list[Tensor]:
