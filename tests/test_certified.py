@@ -15,6 +15,7 @@ import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.master import loss
 from torchchain.master.certificate import certify
+from torchchain.master.fits import FitWarning
 from torchchain.master.proof import Certificate
 
 B = 16
@@ -102,6 +103,31 @@ def test_an_order_that_is_asked_for_is_fitted_as_it_is(transfer):
     assert len(master.model.amplitudes) == 5
     assert master.calibration.report.certificate is None  # its energies are negative at early times
     assert not certify(master.model).holds
+
+
+@pytest.mark.parametrize("order", [(1, 2), (3, 4), (2, 2)])  # the last is none that selection tries
+def test_an_order_that_is_asked_for_can_be_certified(transfer, order):
+    with pytest.warns(FitWarning, match="certified=True makes one of that order"):
+        free = tc.calibrate(transfer, order=order, bootstrap=0)
+    master = tc.calibrate(transfer, order=order, certified=True, bootstrap=0)
+    assert master.calibration.report.fit.order == order
+    assert master.calibration.report.certificate == certify(master.model)
+    energies = torch.einsum("ms,str->mtr", starts(), master.model.transfer(LATE))
+    assert float(energies.min()) >= -1e-12
+    assert float((energies.sum(-1) - 1).abs().max()) < 1e-11
+    off, far = (
+        float(tc.total_variation(each.model.transfer(transfer.times), transfer.mean)[:, 1:].mean())
+        for each in (master, free)
+    )
+    assert off < 1.05 * far  # the functions for the first collisions more than make up for it
+
+
+def test_damped_chains_have_no_certificate():
+    damped = tc.band_transfer(
+        tc.Scene(n_particles=32, n_bands=4, realizations=4, damping=0.05, times=np.arange(0, 20, 0.5))
+    )
+    with pytest.raises(FieldError, match="certified must be False for damped chains"):
+        tc.calibrate(damped, "projection", order=(1, 1), certified=True)
 
 
 def test_joined_bands_stay_certified(memory):

@@ -137,7 +137,7 @@ def calibrate(
             that would take long ("adam", "nonlinear") and with fewer than 4 blocks of realizations.
         progress: show a bar if the output is a terminal.
         settings: for "adam" the fields of :class:`AdamSettings`; for "projection" ``order``, the numbers of exponentials
-            and of pairs, for "logistic" ``degrees`` in place, distance and time (none: the smallest that reaches the ensemble's own error on held-out realizations).
+            and of pairs, and ``certified``, for one of that order that is never negative; for "logistic" ``degrees`` in place, distance and time (none: the smallest that reaches the ensemble's own error on held-out realizations).
 
     Returns:
         MasterEquation, whose ``calibration.report`` tells how the model was chosen and fitted.

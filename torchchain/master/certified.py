@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import torch
 
+from torchchain import checks
 from torchchain.ensemble.statistics import total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.certificate import CertificateError, certify
@@ -15,7 +16,7 @@ from torchchain.master.fits import FitWarning
 from torchchain.master.memory import ORDERS, MemoryModel, ProjectionReport
 from torchchain.master.model import TransferModel
 from torchchain.master.nonnegative import nonnegative
-from torchchain.master.proof import Certificate
+from torchchain.master.proof import ROUNDING, Certificate
 from torchchain.master.records import Fitted, Progress, Recipe
 from torchchain.master.sample import Sample, decade_weights
 
@@ -36,7 +37,8 @@ def certified(
         transfer: of chains without damping.
         asked: the recipe of the free fit.
         free: the fit and its report.
-        mend: whether another model may take the place of the free fit; not where its order was asked for.
+        mend: whether another model may take the place of the free fit; not where its order was asked for, unless that is to
+            be certified: then the one with its decay rates does, however near.
         progress: called with 1 after every order.
         spare: whether another model takes its place where none is found.
 
@@ -44,10 +46,16 @@ def certified(
         The model, the report of the fit that found its decay rates, and its certificate: the nearest where none is as
         good; the free fit where no other was found, with a certificate if it has one.
 
+    Raises:
+        FieldError: where an order that is asked for has no model that is never negative, and is to.
+
     Warns:
-        FitWarning: if the model that is left diverges, or is farther from the ensemble because the free fit diverged.
+        FitWarning: if the model that is left may be negative, or is farther from the ensemble because the free fit diverged.
     """
     model, told = free
+    if asked.settings.certified and not mend:
+        return _of_order(transfer, free)
+    how = "certified=True makes one of that order that is never negative"
     far = _distance(model, transfer)
     nearest: tuple[float, TransferModel, ProjectionReport, Certificate] | None = None
     for other, report, proof in _found(transfer, asked, free) if mend else ():
@@ -71,8 +79,29 @@ def certified(
             )  # fmt: skip
             return nearest[1:]
         if not spare:
-            warnings.warn(f"{wild}: do not predict other times than it was fitted to", FitWarning, stacklevel=3)
+            other = "" if mend else f", or {how}"
+            warnings.warn(f"{wild}: do not predict other times than it was fitted to{other}", FitWarning, stacklevel=3)
+    elif not mend and proof.lower < low - ROUNDING:
+        warnings.warn(
+            f"energies of a model of order {told.order} may go down to {proof.lower:.2g} of the total: {how}",
+            FitWarning,
+            stacklevel=3,
+        )
     return (model, told, None) if nearest is None else nearest[1:]
+
+
+def _of_order(transfer: BandTransfer, free: Fitted) -> tuple[TransferModel, ProjectionReport, Certificate]:
+    """The model with the free fit's decay rates that is never negative."""
+    model, told = free
+    assert isinstance(model, MemoryModel), "of the method 'projection'"
+    proof = certify(model)
+    if proof.holds:
+        return model, told, proof
+    try:
+        found, proof = nonnegative(model, transfer.times, transfer.mean, Sample.of(transfer).distance)
+    except CertificateError as error:
+        raise checks.fail("certified", f"be False for order {told.order} of these energies", str(error)) from None
+    return found, told, proof
 
 
 def _found(

@@ -160,16 +160,23 @@ class MemoryModel(TransferModel):
 
 @dataclass(frozen=True)
 class ProjectionSettings:
-    """Settings of the projection: the order, None for the smallest that reaches the ensemble's own error.
+    """Settings of the projection.
+
+    Attributes:
+        order: None for the smallest that reaches the ensemble's own error.
+        certified: whether an order that is given is fitted again, with its decay rates and some for the first collisions, so
+            that no energy is negative at any time, with the proof; an order that is chosen is so in any case where possible.
 
     Example:
         >>> tc.master.ProjectionSettings(order=(1, 2))
-        ProjectionSettings(order=(1, 2))
+        ProjectionSettings(order=(1, 2), certified=False)
     """
 
     order: tuple[int, int] | None = None
+    certified: bool = False
 
     def __post_init__(self) -> None:
+        checks.instance("certified", self.certified, bool)
         if self.order is None:
             return
         if not isinstance(self.order, (tuple, list)) or len(self.order) != 2:
@@ -263,6 +270,8 @@ def _stays(sample: Sample) -> Tensor:
 
 
 def _fit(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
+    if recipe.settings.certified and sample.damped:
+        raise checks.fail("certified", "be False for damped chains, whose energies no certificate covers", True)
     basis, order = _stays(sample), recipe.settings.order
     rates = torch.einsum("t,str->sr", linear_weights(sample.times, recipe.window), sample.mean)
     with single_blas_thread():
