@@ -16,7 +16,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,8 @@ Writer = Callable[[Path], None]
 
 def load() -> None:
     """Import what results are drawn and written with, half a second, while something else goes on."""
-    import xarray  # noqa: F401
+    for name in ("xarray", "h5netcdf", "scipy.interpolate", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        import_module(name)
 
 
 @contextmanager

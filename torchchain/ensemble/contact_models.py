@@ -6,8 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import scipy
-
 from torchchain import checks
 
 OPENING = 0.2
@@ -82,4 +80,8 @@ def _edge(error: Callable[[float, float], float], end: float, tolerance: float) 
     top = OPENING if math.isinf(error(1.0, end)) else 1.0
     if error(top, end) <= tolerance:
         return top
-    return float(scipy.optimize.brentq(lambda a: error(a, end) - tolerance, 0.0, top, xtol=1e-12))
+    low = 0.0
+    for _ in range(52):  # errors grow with the elongation; loading a solver of SciPy's takes longer than a plan
+        middle = (low + top) / 2
+        low, top = (middle, top) if error(middle, end) <= tolerance else (low, middle)
+    return low
