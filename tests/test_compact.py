@@ -161,6 +161,45 @@ def test_gradient_of_the_regression():
     assert (ahead - behind) / 2e-5 == pytest.approx(-2 * pull @ along, rel=1e-6)
 
 
+def test_normal_equations_are_those_of_the_derivatives():
+    """Of the shares by every coefficient, by finite differences; and of several right-hand sides at once."""
+    draw = np.random.default_rng(5)
+    for degrees in (DEGREES, (1, 1, 1), (3, 5, 2)):
+        times = scene().times[1:40:8]
+        truth = random_model(size=0.2).transfer(times)
+        problem = Regression.of(Waves.of(scene()), degrees, times, truth, draw.uniform(1, 3, truth.shape[:2]))
+        at = 0.1 * draw.normal(size=int(problem.held.sum()))
+        steps = 1e-5 * np.eye(len(at))
+        ahead, behind = ([problem.predicted(problem.table(at + sign * step)) for step in steps] for sign in (1, -1))
+        slopes = (np.stack(ahead) - np.stack(behind)) / 2e-5 * problem.weight[..., None]
+        found = problem.predicted(problem.table(at))
+        matrix, pull = problem.normal(found, problem.table(at))
+        expected = np.einsum("astr,bstr->ab", slopes, slopes) + logistic.RIDGE * np.eye(len(at))
+        assert abs(matrix - expected).max() < 1e-8 * expected.max()
+        missed = draw.normal(size=(2, *found.shape))
+        expected = np.einsum("astr,nstr->na", slopes, missed * problem.weight[..., None])
+        assert abs(problem.pull(found, missed) - expected).max() < 1e-8 * abs(expected).max()
+        forced = problem.pull(found, problem.data - found) - logistic.RIDGE * at
+        assert abs(pull - forced).max() < 1e-12 * abs(forced).max()
+
+
+def test_normal_equations_of_tiny_shares():
+    """Where next to nothing has left its band no digits are lost against what stays there."""
+    times = torch.tensor([1e-2, 2e-2], dtype=torch.float64)
+    model = random_model(size=0.2)
+    problem = Regression.of(Waves.of(scene()), DEGREES, times, model.transfer(times), np.full((B, 2), 1e10))
+    table = problem.table(0.1 * np.random.default_rng(6).normal(size=int(problem.held.sum())))
+    found = problem.predicted(table)
+    matrix, _ = problem.normal(found, table)
+    away = problem.shape - problem.shape[range(B), range(B)][:, None]  # 0 where most is
+    slope = away[:, None] - np.einsum("str,srp->stp", found, away)[:, :, None]
+    slope = np.einsum("strp,str,tk->strpk", slope, found, problem.clock)[..., problem.held] * 1e10
+    expected = np.einsum("stra,strb->ab", slope, slope) + logistic.RIDGE * np.eye(len(matrix))
+    assert float(found[0, 0, 1]) < 1e-9
+    scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
+    assert (abs(matrix - expected) / scale).max() < 1e-10
+
+
 def test_fresh_chains_are_predicted_at_early_and_late_times(transfers):
     own, fresh = transfers
     model, _ = fitted(own, (8, 6, 12))
@@ -193,7 +232,7 @@ def test_a_step_of_gauss_and_newton_is_a_fit_to_other_data(transfers):
     same, changed = logistic.stepped(
         [problem], np.ones((1, 1)), model.coefficients.numpy()[None], [np.stack([problem.data, moved])]
     )[:, 0]
-    again = Regression(problem.odds, problem.shape, problem.clock, problem.held, moved, problem.weight)
+    again = dataclasses.replace(problem, data=moved)
     found, _ = logistic.solve([again], np.ones((1, 1)), model.coefficients.numpy()[None])
     times = own.times
     exact = CompactModel(**{**model.tensors(), "coefficients": torch.from_numpy(found[0])}).transfer(times)

@@ -16,7 +16,7 @@ from torchchain.ensemble.fused import band_energy
 from torchchain.ensemble.starts import start_tones
 from torchchain.master.compact import n_coefficients
 from torchchain.master.equation import PredictionWarning
-from torchchain.master.logistic import solve
+from torchchain.master.logistic import RIDGE, solve
 from torchchain.master.starts import StartModel
 from torchchain.master.tones import ToneRegression, Tones, shares
 
@@ -257,6 +257,14 @@ def test_derivatives_of_the_regression():
         moved[1][i] -= 1e-5
         up, down = (problem.misfit(problem.table(x))[0] for x in moved)
         assert -(up - down) / 4e-5 == pytest.approx(pull[i], rel=1e-5, abs=1e-8)
+    found = []
+    for sign in (1, -1):
+        each = (problem.misfit(problem.table(here + sign * step))[1] for step in 1e-5 * np.eye(len(here)))
+        found.append(np.stack([problem._bands(slots) for slots in each]))
+    slopes = (found[0] - found[1]) / 2e-5
+    matrix, _ = problem.normal(slots, problem.table(here))
+    expected = np.einsum("astr,bstr->ab", slopes, slopes) + RIDGE * np.eye(len(here))
+    assert abs(matrix - expected).max() < 1e-8 * expected.max()
 
 
 def fresh(start, times, count=160, seed=77):

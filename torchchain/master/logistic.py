@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ from torchchain.master.compact import (
     clock_of,
     polynomials,
     shapes,
-    terms,
 )
+from torchchain.master.normal import Equations, products
 from torchchain.master.waves import Waves, first_odds
 
 RIDGE = 1.0
@@ -41,7 +42,7 @@ class Regression:
         odds: first odds D with 1 for the own band, [source, time, receiver].
         shape: polynomials of place and distance, of a source's own band last, [source, receiver, term].
         clock: polynomials of time, (time, degree).
-        held: which products of the two are coefficients, bool (term, degree).
+        degrees: in place, distance and time.
         data: T, [source, time, receiver].
         weight: of each source and time, [source, time], the inverse of its error.
     """
@@ -49,7 +50,7 @@ class Regression:
     odds: np.ndarray
     shape: np.ndarray
     clock: np.ndarray
-    held: np.ndarray
+    degrees: tuple[int, int, int]
     data: np.ndarray
     weight: np.ndarray
 
@@ -71,17 +72,23 @@ class Regression:
         first, own = parts
         eye = torch.eye(len(odds), dtype=torch.float64)
         shape = torch.cat([first * (1 - eye)[..., None], own * eye[..., None]], dim=-1)
-        held = np.zeros((shape.shape[-1], degrees[2] + 1), dtype=bool)
-        row = 0
-        for part in terms(degrees):
-            heads = list(dict.fromkeys(entry[:-1] for entry in part))
-            for entry in part:
-                held[row + heads.index(entry[:-1]), entry[-1]] = True
-            row += len(heads)
         clock = polynomials(clock_of(times), degrees[2])
         return cls(
-            odds.numpy(), shape.numpy(), clock.numpy(), held, data.numpy(), np.broadcast_to(weight, data.shape[:2])
+            odds.numpy(), shape.numpy(), clock.numpy(), degrees, data.numpy(), np.broadcast_to(weight, data.shape[:2])
         )
+
+    @property
+    def held(self) -> np.ndarray:
+        """Which products of shapes and clock are coefficients, bool (term, degree)."""
+        return products(self.degrees).held
+
+    @cached_property
+    def equations(self) -> Equations:
+        """The linearized problem."""
+        size, bands = len(products(self.degrees).heads), np.arange(len(self.odds))
+        between = self.shape[..., :size].copy()
+        between[bands, bands, 0] = 1.0  # any: what stays has odds of another kind
+        return Equations(between, self.shape[bands, bands, size:], self.clock, self.degrees)
 
     def predicted(self, coefficients: np.ndarray) -> np.ndarray:
         """T [source, time, receiver] for coefficients as a (term, degree) table."""
@@ -98,21 +105,13 @@ class Regression:
 
     def normal(self, found: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Matrix and right-hand side of the linearized problem, over the coefficients that are held."""
-        size, degree = self.held.shape
-        squares, pull = np.zeros((len(self.clock), size, size)), np.zeros((size, degree))
-        for i, weight in enumerate(self.weight.T[..., None]):
-            slope = self._slope(found[:, i], weight)
-            squares[i] = slope.T @ slope
-            pull += np.outer(slope.T @ ((self.data[:, i] - found[:, i]) * weight).ravel(), self.clock[i])
-        matrix = np.einsum("tab,tc,td->acbd", squares, self.clock, self.clock, optimize=True)
-        held = self.held.ravel()
-        matrix = matrix.reshape(len(held), -1)[np.ix_(held, held)]
-        return matrix + RIDGE * np.eye(len(matrix)), (pull - RIDGE * coefficients).ravel()[held]
+        matrix = self.equations.matrix(moved(found), found, self.weight)
+        matrix.flat[:: len(matrix) + 1] += RIDGE
+        return matrix, self.pull(found, self.data - found) - RIDGE * coefficients[self.held]
 
-    def _slope(self, found: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Derivative of one time's T by the exponents' terms, (source receiver, term)."""
-        mean = np.matmul(found[:, None], self.shape)
-        return ((self.shape - mean) * (found * weight)[..., None]).reshape(found.size, -1)
+    def pull(self, found: np.ndarray, missed: np.ndarray) -> np.ndarray:
+        """Right-hand side of what is missed, (..., source, time, receiver), over the coefficients that are held."""
+        return self.equations.pull(moved(found), found, missed * self.weight[..., None] ** 2)
 
     def guided(self, guide: np.ndarray) -> Regression:
         """The regression for what is to be added to known coefficients, which are multiplied into its odds."""
@@ -124,6 +123,13 @@ class Regression:
         table = np.zeros(self.held.shape)
         table[self.held] = held
         return table
+
+
+def moved(shares: np.ndarray) -> np.ndarray:
+    """What of the shares [source, time, receiver] has left its own band."""
+    found, bands = shares.copy(), np.arange(len(shares))
+    found[bands, :, bands] = 0.0
+    return found
 
 
 def solve(
@@ -217,11 +223,7 @@ def stepped(
     square, rest = _joint(regressions, mixing, found, predicted, stiff)
     pulls = np.repeat(rest[None], len(drawn[0]), axis=0)
     for r, p, m, data in zip(regressions, predicted, mixing, drawn, strict=True):
-        force = np.zeros((len(data), *r.held.shape))
-        for i, weight in enumerate(r.weight.T[..., None]):
-            change = ((data[:, :, i] - r.data[:, i]) * weight).reshape(len(data), -1)
-            force += (change @ r._slope(p[:, i], weight))[:, :, None] * r.clock[i]
-        pulls += m[:, None] * force[:, r.held][:, None]
+        pulls += m[:, None] * r.pull(p, data - r.data)[:, None]
     return found + np.linalg.solve(square, pulls.reshape(len(pulls), -1).T).T.reshape(pulls.shape)
 
 

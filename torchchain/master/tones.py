@@ -18,7 +18,6 @@ wave's own part of it decays: the share (variance / N) (1 - cos(w t) exp(-g t)) 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +27,7 @@ from torch import Tensor
 from torchchain.ensemble.starts import KINDS
 from torchchain.master.compact import LARGEST_EXPONENT, clock_of, polynomials, terms
 from torchchain.master.logistic import RIDGE
+from torchchain.master.normal import Equations, products
 from torchchain.master.waves import WIDTH, poles, scattered
 
 ONSET = 0.1
@@ -94,7 +94,7 @@ class Tones:
         each = each * (torch.arange(len(self), device=times.device)[:, None] != numbers[:, None, None])
         return each.reshape(len(numbers), self.n_bands, self.width, len(times)).sum(2).transpose(1, 2)
 
-    def shapes(self, numbers: Tensor, degrees: Sequence[int]) -> Tensor:
+    def shapes(self, numbers: Tensor, degrees: tuple[int, int, int]) -> Tensor:
         """Polynomials of place and distance, (source, slot, term): slots are the bands, and last the source's own tone."""
         every = torch.arange(len(self), device=self.frequency.device)
         place = (every.to(self.frequency) + 0.5) / len(self)
@@ -131,21 +131,11 @@ class Tones:
         return far / total.clamp(min=1e-300)
 
 
-def held(degrees: Sequence[int]) -> np.ndarray:
-    """Which products of a shape and a polynomial of time are coefficients, bool (term, degree)."""
-    rows = []
-    for part in terms(degrees):
-        for head in dict.fromkeys(entry[:-1] for entry in part):
-            here = {entry[-1] for entry in part if entry[:-1] == head}
-            rows.append([k in here for k in range(degrees[2] + 1)])
-    return np.array(rows)
-
-
 def shares(
-    tones: Tones, kind: str, degrees: Sequence[int], coefficients: Tensor, numbers: Tensor, times: Tensor
+    tones: Tones, kind: str, degrees: tuple[int, int, int], coefficients: Tensor, numbers: Tensor, times: Tensor
 ) -> Tensor:
     """T (source, time, band) of some sources: odds over their sum, never negative; of kicks, over that and what is at k = 0."""
-    index = torch.from_numpy(held(degrees)).to(coefficients.device)
+    index = torch.from_numpy(products(degrees).held).to(coefficients.device)
     table = coefficients.new_zeros(index.shape).masked_scatter(index, coefficients)
     exponent = torch.einsum(
         "srp,pt->str", tones.shapes(numbers, degrees), table @ polynomials(clock_of(times), degrees[2]).T
@@ -171,7 +161,7 @@ class ToneRegression:
         self,
         tones: Tones,
         kind: str,
-        degrees: Sequence[int],
+        degrees: tuple[int, int, int],
         numbers: Tensor,
         times: Tensor,
         data: Tensor,
@@ -181,8 +171,10 @@ class ToneRegression:
         self.odds = torch.cat([odds, torch.ones_like(odds[..., :1])], -1).numpy()
         self.shape = tones.shapes(numbers, degrees).numpy()
         self.clock = polynomials(clock_of(times), degrees[2]).numpy()
-        self.held, self.data, self.weight = held(degrees), data.numpy(), weight.numpy()
+        self.held, self.data, self.weight = products(degrees).held, data.numpy(), weight.numpy()
         self.own = np.arange(len(numbers)), tones.band(numbers).numpy()
+        size = len(products(degrees).heads)
+        self.equations = Equations(self.shape[:, :-1, :size], self.shape[:, -1, size:], self.clock, degrees)
 
     def table(self, coefficients: np.ndarray) -> np.ndarray:
         """Coefficients as a table, zeros where none is."""
@@ -200,21 +192,11 @@ class ToneRegression:
 
     def normal(self, slots: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Matrix and right-hand side of the linearized problem, over the coefficients that are held."""
-        size, degree = self.held.shape
-        squares, pull = np.zeros((len(self.clock), size, size)), np.zeros((size, degree))
-        missed = (self.data - self._bands(slots)) * self.weight[..., None]
-        for i, clock in enumerate(self.clock):
-            here = slots[:, i]
-            slope = (self.shape - np.matmul(here[:, None], self.shape)) * here[..., None]
-            bands = slope[:, :-1]
-            bands[self.own] += slope[:, -1]
-            bands = (bands * self.weight[:, i, None, None]).reshape(-1, size)
-            squares[i] = bands.T @ bands
-            pull += np.outer(bands.T @ missed[:, i].ravel(), clock)
-        matrix = np.einsum("tab,tc,td->acbd", squares, self.clock, self.clock, optimize=True)
-        index = self.held.ravel()
-        matrix = matrix.reshape(len(index), -1)[np.ix_(index, index)]
-        return matrix + RIDGE * np.eye(len(matrix)), (pull - RIDGE * table).ravel()[index]
+        moved, bands = slots[..., :-1], self._bands(slots)
+        matrix = self.equations.matrix(moved, bands, self.weight)
+        matrix.flat[:: len(matrix) + 1] += RIDGE
+        pull = self.equations.pull(moved, bands, (self.data - bands) * self.weight[..., None] ** 2)
+        return matrix, pull - RIDGE * table[self.held]
 
     def _bands(self, slots: np.ndarray) -> np.ndarray:
         """The source's own tone added to its band, (source, time, band)."""
