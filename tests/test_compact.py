@@ -383,7 +383,7 @@ def test_own_band_error_is_not_averaged_away():
     mean = torch.zeros(shape, dtype=torch.float64)
     predicted = mean + 1e-4 * torch.randn(shape, generator=generator, dtype=torch.float64)
     predicted.diagonal(dim1=0, dim2=2)[...] += 0.01
-    error = model_error(predicted, mean, stderr, torch.zeros_like(stderr))
+    error = model_error(predicted, mean, stderr, stderr)
     own = torch.eye(6, dtype=torch.bool)[:, None].expand(shape)
     assert torch.allclose(error[own], torch.tensor(0.01, dtype=torch.float64), rtol=0.05)
     assert float(error[~own].max()) < 3e-4
@@ -392,8 +392,9 @@ def test_own_band_error_is_not_averaged_away():
 def test_what_noise_explains_is_no_error_of_the_model():
     stderr = torch.full((5, 9, 5), 1e-3, dtype=torch.float64)
     mean = torch.zeros_like(stderr)
-    assert float(model_error(mean + 0.9e-3, mean, stderr, 0 * stderr).max()) == 0
-    with pytest.raises(FieldError, match="spread must have shape"):
+    assert float(model_error(mean + 0.9e-3, mean, stderr, stderr).max()) == 0
+    torch.testing.assert_close(model_error(mean + 1e-3, mean, stderr, 0.6 * stderr), 0.8 * stderr)  # noise that was followed hides less
+    with pytest.raises(FieldError, match="noise must have shape"):
         model_error(mean, mean, stderr, stderr[:2])
 
 

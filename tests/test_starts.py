@@ -337,6 +337,19 @@ def test_a_wave_that_moves_towards_rest_has_energies_below_zero_by_site_as_chain
     assert float(found.min()) < -1e-3
 
 
+def test_the_error_of_a_virial_is_the_change_of_that_of_a_kick(master):
+    zero, one = torch.zeros(N // 2, dtype=torch.float64), torch.zeros(N // 2, dtype=torch.float64)
+    one[13] = 1.0
+    none = torch.zeros(()).double()
+    kick, virial, both = (tc.StartEnergy(zero, k, g, none) for k, g in ((one, zero), (zero, one), (one, one)))
+    times = torch.tensor([0.7, 3.0, 11.0], dtype=torch.float64)
+    before, here, after = (master.standard_error(kick, share * times) for share in (0.8, 1.0, 1.2))
+    slope = (after - before) / (0.4 * times[:, None])
+    assert float(slope.abs().max()) > 0
+    torch.testing.assert_close(master.standard_error(virial, times), slope.abs())
+    torch.testing.assert_close(master.standard_error(both, times), (here + slope).abs())
+
+
 def test_starts_by_name(master):
     times = [0.0, 5.0]
     one = master.solve(tc.Impulse(site=5), times)
@@ -367,6 +380,7 @@ def test_the_file_holds_both_transfers(master, tmp_path):
         ("starts.released", torch.ones(5).double(), "starts.released must have shape"),
         ("starts.frequency", torch.ones(31).double(), "starts.decay must have shape"),
         ("starts.scale", torch.full((2, 2, 24), -1.0), "starts.scale must hold factors"),
+        ("starts.of_source", torch.ones(2, 2, 3, 8), "starts.of_source must have shape"),
         ("starts.kicked", torch.full((10,), torch.nan).double(), "starts.kicked must"),
     ],
 )
@@ -474,10 +488,11 @@ def test_files_without_the_later_tensors_are_read(master, tmp_path):
     master.save(tmp_path / "new.safetensors")
     with safe_open(tmp_path / "new.safetensors", "pt") as file:
         header, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    older = {name: value for name, value in tensors.items() if name not in ("starts.rigid", "starts.onset")}
+    older = {name: value for name, value in tensors.items() if name not in ("starts.rigid", "starts.onset", "starts.of_source")}
     save_file(older, tmp_path / "old.safetensors", header)
     starts = tc.MasterEquation.load(tmp_path / "old.safetensors").starts
     assert float(starts.rigid) == float(starts.onset) == 0
+    assert torch.equal(starts.of_source, torch.ones(2, 2, len(starts.scale_times), B).double())
     torch.testing.assert_close(starts.transfer("kicked", [1, 9], TIMES).sum(-1), torch.ones(2, 4).double(), rtol=0, atol=1e-12)
     save_file(tensors | {"starts.rigid": torch.tensor(-0.1).double()}, tmp_path / "bad.safetensors", header)
     with pytest.raises(FieldError, match="starts.rigid must be a share of the energy"):

@@ -36,7 +36,7 @@ from torchchain.master.logistic import Regression, fit_compact, solve, stepped
 from torchchain.master.misfit import model_error
 from torchchain.master.report import Calibration, Report
 from torchchain.master.sample import Sample
-from torchchain.master.uncertainty import Uncertainty, block_draws, combined, horizon
+from torchchain.master.uncertainty import Uncertainty, block_draws, combined, horizon, of_parts
 from torchchain.master.waves import Waves
 from torchchain.threads import single_blas_thread
 
@@ -320,8 +320,8 @@ def _errors(
         "ms,rsc->mrc", mixing, stepped(problems, mixing, found, [shares_of(each) for each in drawn], _stiffness(sets))
     )
     return [
-        combined(transfer, model, redrawn(transfer, model, window, *rest))
-        for transfer, model, *rest in zip(transfers, models, repeats, drawn, others, strict=True)
+        combined(transfer, model, redrawn(transfer, model, window, repeat, *rest), repeat)
+        for transfer, model, repeat, *rest in zip(transfers, models, repeats, drawn, others, strict=True)
     ]
 
 
@@ -337,8 +337,9 @@ def joined(members: Sequence[MasterEquation]) -> list[MasterEquation]:
         model, errors = _model(sample, member.rates.detach(), told.degrees, row, guide), member.uncertainty
         if errors is not None:
             before, now = (each.transfer(errors.times).detach() for each in (member.model, model))
-            off = model_error(now, before, errors.stderr, errors.stderr)
-            errors = replace(errors, stderr=(errors.stderr.square() + off.square()).sqrt())
+            noise, misfit = errors.parts(errors.times)
+            off = model_error(now, before, errors.stderr, torch.zeros_like(now))
+            errors = of_parts(errors.rates_stderr, errors.basis_stderr, errors.times, noise, misfit + off.square())
         record = member.calibration
         report = replace(record.report, fit=told, certificate=model.certificate)
         again.append(MasterEquation(model, replace(record, method="logistic", model="compact", report=report), errors))
@@ -362,8 +363,8 @@ def errors_between(
 ) -> Uncertainty | None:
     """Error bars of the model of a scene between those of members: theirs, and by how much interpolation may be off.
 
-    Errors of the odds are those of a mixture of the nearest two strengths', which are independent. What interpolation is off by is taken from the
-    distance to a polynomial of sqrt(xi) of one degree less.
+    Errors of the odds are those of a mixture of the nearest two strengths': by the noise of their ensembles they are independent; by what models
+    of this form miss they are alike. What interpolation is off by is taken from the distance to a polynomial of sqrt(xi) of one degree less.
     """
     held = [(member, member.uncertainty) for member in members if member.uncertainty is not None]
     if len(held) < len(members):
@@ -374,24 +375,28 @@ def errors_between(
     told = _at(scene, max(strength, THEORY_WEAKEST))
     times = held[shares.index(max(shares))][1].times
     eye, here = torch.eye(model.n_bands, dtype=torch.float64), model.transfer(times).detach()
-    variance, slopes, bases = torch.zeros_like(here), torch.zeros_like(eye), torch.zeros_like(eye)
+    noise, missed, slopes, bases = (torch.zeros_like(x) for x in (here, here, eye, eye))
     for weight, (member, errors) in zip(shares, held, strict=True):
         if weight:
             scale = weight * _odds_slope(here) / _odds_slope(member.model.transfer(times).detach())
             late = weight * _odds_slope(model.basis) / _odds_slope(member.basis.detach())
-            variance += (errors.of(eye, times) * scale).square()
+            by_noise, by_misfit = errors.parts(times)
+            noise += by_noise * scale.square()
+            missed += by_misfit.sqrt() * scale
             bases += (errors.basis_stderr * late).square()
             slopes += (weight * errors.rates_stderr).square()
     if guided:
-        variance = variance * _shared(_at(scene, known[0]), told, times).square()
-    spread = variance.sqrt()
+        less = _shared(_at(scene, known[0]), told, times)
+        noise, missed = noise * less.square(), missed * less
+    misfit = missed.square()
     if strength not in known and sets > 1:
         if guided:
             lower = _below(members[0], told, times, 1)
         else:
             lower = between(members, scene, sets - 1, 1, model.guide if len(model.guide) else None).transfer(times)
-        spread = (variance + model_error(here, lower.detach(), spread, spread).square()).sqrt()
-    return Uncertainty(slopes.sqrt(), bases.sqrt(), times, spread)
+        unit = (noise + misfit).sqrt()
+        misfit = misfit + model_error(here, lower.detach(), unit, torch.zeros_like(here)).square()
+    return of_parts(slopes.sqrt(), bases.sqrt(), times, noise, misfit)
 
 
 def _odds_slope(share: Tensor) -> Tensor:

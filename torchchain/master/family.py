@@ -29,7 +29,7 @@ from torchchain.master.memory import MemoryModel
 from torchchain.master.report import Loss, Report
 from torchchain.master.starts import StartModel, can_fit, fit_starts, with_errors
 from torchchain.master.starts import between as between_starts
-from torchchain.master.uncertainty import Uncertainty
+from torchchain.master.uncertainty import Uncertainty, of_parts
 
 NEIGHBORS = 4
 MOST_KEPT = 8
@@ -334,19 +334,20 @@ def _combined_loss(losses: Sequence[tuple[float, Loss | None]]) -> Loss | None:
 
 
 def _combined_errors(parts: Sequence[tuple[float, MasterEquation]]) -> Uncertainty | None:
-    """Errors of the weighted sum, those of different members being independent."""
+    """Errors of the weighted sum: by noise those of different members are independent, by misfit alike."""
     held = [(weight, member.uncertainty) for weight, member in parts if member.uncertainty is not None]
     if len(held) < len(parts):
         return None
     times = held[0][1].times
-    eye = torch.eye(len(held[0][1].rates_stderr), dtype=times.dtype)
+    split = [(weight, *errors.parts(times)) for weight, errors in held]
 
     def joined(values: list[Tensor]) -> Tensor:
         return torch.stack([(w * v).square() for (w, _), v in zip(held, values, strict=True)]).sum(0).sqrt()
 
-    return Uncertainty(
+    return of_parts(
         joined([errors.rates_stderr for _, errors in held]),
         joined([errors.basis_stderr for _, errors in held]),
         times,
-        joined([errors.of(eye, times) for _, errors in held]),
+        torch.stack([weight**2 * noise for weight, noise, _ in split]).sum(0),
+        torch.stack([weight * misfit.sqrt() for weight, _, misfit in split]).sum(0).square(),
     )

@@ -14,7 +14,7 @@ ROUNDING = 1e-14
 """Errors of a share of the energy that are none, at time 0 and just after."""
 
 
-def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, spread: Tensor) -> Tensor:
+def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, noise: Tensor) -> Tensor:
     """Standard error of a model beyond its statistical one, [source, time, receiver].
 
     What is missed is counted in units of the ensemble's error, which grows as t^4 at first, and averaged over neighbors: the
@@ -24,16 +24,16 @@ def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, spread: Tensor)
     Args:
         predicted, mean: the model's and the ensemble's transfer, [source, time, receiver].
         stderr: standard error of the ensemble's.
-        spread: standard error of the model's by bootstrap, which explains a part of what is missed.
+        noise: standard deviation of their difference by the ensemble's noise alone: less than ``stderr`` where the model
+            has followed that noise.
     """
-    for name, value in (("mean", mean), ("stderr", stderr), ("spread", spread)):
+    for name, value in (("mean", mean), ("stderr", stderr), ("noise", noise)):
         if value.shape != predicted.shape:
             raise checks.fail(name, f"have shape {tuple(predicted.shape)}", f"shape {tuple(value.shape)}")
     variance = stderr.square()
-    noise = (variance - spread.square()).clamp(min=0)
     told = variance > ROUNDING**2
     unit = torch.where(told, variance, torch.ones_like(variance))
-    excess = ((predicted - mean).square() - noise) / unit
+    excess = ((predicted - mean).square() - noise.square()) / unit
     own = torch.eye(len(mean), dtype=torch.bool, device=mean.device)[:, None].expand_as(mean)
     table = excess.diagonal(dim1=0, dim2=2)[None]  # [1, time, source]
     kept = functional.avg_pool2d(

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import combinations_with_replacement
 from typing import Any, ClassVar
 
 import numpy as np
@@ -42,6 +43,10 @@ TOGETHER = 2**22
 FOLLOWED = (0.37, 0.16)
 """Share of the data's variance that a fit follows, in the source's own band and in others: by how much, squared, the models of
 two ensembles differ (seeds 0 and 1 of `experiments/any_start.py`, no other chains)."""
+NEARBY = 0.2
+"""Share of a time by which errors are looked at before and after it, for their derivative."""
+LEAST = 1e-30
+"""Variance below which there is none."""
 EVENNESS = 0.5
 """Weight of a source's own error in a fit, rather than of the mean over sources."""
 
@@ -61,17 +66,21 @@ class StartModel(nn.Module):
         scale_times, scale: errors of T and T' over those of the bands' own model, in the source's own band and in others,
             at some times, (start_time,) and (kind, part, start_time); no times if unknown.
         rigid, onset: as of :class:`torchchain.master.tones.Tones`; 0 in files that do not know them.
+        of_source: errors of each source over ``scale``, (kind, part, start_time, band); 1 in files that do not know them.
     """
 
     AXES: ClassVar[dict[str, tuple[str, ...]]] = {
         "degrees": ("degree",), "released": ("term",), "kicked": ("term",), "frequency": ("start_tone",), "decay": ("start_tone",),
         "coupling": (), "scale_times": ("start_time",), "scale": ("kind", "part", "start_time"), "rigid": (), "onset": (),
+        "of_source": ("kind", "part", "start_time", "band"),
     }  # fmt: skip
-    OPTIONAL: ClassVar[tuple[str, ...]] = ("rigid", "onset")
+    SHARES: ClassVar[tuple[str, ...]] = ("rigid", "onset")
+    OPTIONAL: ClassVar[tuple[str, ...]] = (*SHARES, "of_source")
 
     def __init__(
         self, degrees: Tensor, released: Tensor, kicked: Tensor, frequency: Tensor, decay: Tensor, coupling: Tensor,
         scale_times: Tensor, scale: Tensor, n_bands: int, rigid: Tensor | None = None, onset: Tensor | None = None,
+        of_source: Tensor | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         degrees = checks.real_tensor("starts.degrees", degrees)
@@ -82,6 +91,7 @@ class StartModel(nn.Module):
             "decay": (decay, (count,)), "coupling": (coupling, ()), "scale_times": (scale_times, (len(scale_times),)),
             "scale": (scale, (2, 2, len(scale_times))),
             **{name: (coupling.new_zeros(()) if x is None else x, ()) for name, x in (("rigid", rigid), ("onset", onset))},
+            "of_source": (scale[..., None].new_ones(*scale.shape, n_bands) if of_source is None else of_source, (2, 2, len(scale_times), n_bands)),
         }  # fmt: skip
         for name, (value, shape) in shapes.items():
             value = checks.real_tensor(f"starts.{name}", value).double()
@@ -89,16 +99,21 @@ class StartModel(nn.Module):
                 raise checks.fail(f"starts.{name}", f"have shape {shape}", f"shape {tuple(value.shape)}")
             if name in ("frequency", "decay", "coupling"):
                 checks.first_bad(f"starts.{name}", "be positive", value, ~(value > 0), "tone")
-            if name in self.OPTIONAL and not (float(value) >= 0 and (name == "onset" or float(value) <= 0.25)):
+            if name in self.SHARES and not (float(value) >= 0 and (name == "onset" or float(value) <= 0.25)):
                 raise checks.fail(f"starts.{name}", "be a share of the energy", float(value))
             self.register_buffer(name, value.detach().clone())
         self.released: Tensor
         self.kicked: Tensor
         self.scale_times: Tensor
         self.scale: Tensor
+        self.of_source: Tensor
         if not count or count % n_bands:
             raise checks.fail("starts.frequency", f"hold tones of {n_bands} bands alike", count)
-        if not bool((self.scale >= 0).all()) or not bool((self.scale_times.diff() > 0).all()):
+        if (
+            not bool((self.scale >= 0).all())
+            or not bool((self.of_source >= 0).all())
+            or not bool((self.scale_times.diff() > 0).all())
+        ):
             raise checks.fail("starts.scale", "hold factors at increasing times", "others")
         self.n_bands = n_bands
 
@@ -125,7 +140,7 @@ class StartModel(nn.Module):
     @property
     def _tones(self) -> Tones:
         return Tones(
-            **{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling", *self.OPTIONAL)},
+            **{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling", *self.SHARES)},
             n_bands=self.n_bands,
         )
 
@@ -183,30 +198,36 @@ class StartModel(nn.Module):
     def standard_error(self, start: StartEnergy, times: Tensor, uncertainty: Uncertainty) -> Tensor:
         """Standard error of :meth:`solve`, (*batch, time, band), from that of the bands' own model.
 
-        Tones of one band have the same error, released or kicked, and bands have errors of their own.
+        Tones of one band have the same error, released or kicked, whose derivative by time is that of the virial's part,
+        and bands have errors of their own.
         """
         self.check(start)
         times = times.to(self.released)
         width = start.potential.shape[-1] // self.n_bands
-        each = uncertainty.of(torch.eye(self.n_bands).to(times), times).square()
-        own = torch.eye(self.n_bands, device=times.device)[:, None].expand_as(each) > 0
+        values = [getattr(start, name).to(self.released) for name in ("potential", "kinetic", "virial")]
+        energies = [x.reshape(*x.shape[:-1], self.n_bands, width).sum(-1) for x in values]
+        errors = [self._errors(row, times, uncertainty) for row in range(len(KINDS))]
+        before, after = (1 - NEARBY) * times, (1 + NEARBY) * times
+        change = self._errors(1, after, uncertainty) - self._errors(1, before, uncertainty)
+        errors.append(change / (after - before).clamp(min=torch.finfo(times.dtype).tiny)[:, None])
         total = self.released.new_zeros(*start.rigid.shape, len(times), self.n_bands)
-        energies, factors = [], []
-        for row, name in enumerate(("potential", "kinetic")):
-            values = getattr(start, name).to(self.released)
-            energies.append(values.reshape(*values.shape[:-1], self.n_bands, width).sum(-1))
-            inside, outside = (self._scale(row, part, times)[:, None] for part in range(2))
-            factors.append(torch.where(own, inside, outside))
-        for i, j in ((0, 0), (1, 1), (0, 1), (1, 0)):
-            both = energies[i] * energies[j]
-            total = total + torch.einsum("...s,str->...tr", both, each * factors[i] * factors[j])
-        return total.sqrt()
+        for i, j in combinations_with_replacement(range(len(errors)), 2):
+            both = energies[i] * energies[j] * (1 + (i != j))
+            total = total + torch.einsum("...s,str->...tr", both, errors[i] * errors[j])
+        return total.clamp(min=0).sqrt()
 
-    def _scale(self, row: int, part: int, times: Tensor) -> Tensor:
+    def _errors(self, row: int, times: Tensor, uncertainty: Uncertainty) -> Tensor:
+        """Standard error of T or T', [source, time, receiver]."""
+        each = uncertainty.of(torch.eye(self.n_bands).to(times), times)
         if not len(self.scale_times):
-            return torch.ones_like(times)
-        found = np.interp(times.cpu().numpy(), self.scale_times.cpu().numpy(), self.scale[row, part].cpu().numpy())
-        return torch.from_numpy(found).to(times)
+            return each
+        own = torch.eye(self.n_bands, device=times.device)[:, None].expand_as(each) > 0
+        factors = self.scale[row, :, :, None] * self.of_source[row]  # [part, time, source]
+        after = torch.searchsorted(self.scale_times, times.contiguous()).clamp(1, len(self.scale_times) - 1)
+        low, high = self.scale_times[after - 1], self.scale_times[after]
+        weight = ((times - low) / (high - low)).clamp(0, 1)[:, None]
+        inside, outside = torch.lerp(factors[:, after - 1], factors[:, after], weight).transpose(1, 2)[..., None]
+        return each * torch.where(own, inside, outside)
 
     def check(self, start: StartEnergy) -> None:
         """An error for a start on rings of another length."""
@@ -293,8 +314,10 @@ def between(lower: tuple[float, StartModel], upper: tuple[float, StartModel], sc
     part, tones = math.log(scene.disorder.strength / low) / math.log(high / low), _tones(scene)
     mixed = {kind: torch.lerp(getattr(first, kind), getattr(last, kind), part) for kind in KINDS}
     own = {name: getattr(tones, name) for name in ("frequency", "decay", "coupling", "rigid", "onset")}
+    every = torch.maximum(*(model.scale[..., None] * model.of_source for model in (first, last)))
     scale = torch.maximum(first.scale, last.scale)
-    return StartModel(**first.tensors() | mixed | own | {"scale": scale}, n_bands=first.n_bands)
+    errors = {"scale": scale, "of_source": every / scale[..., None].clamp(min=LEAST)}
+    return StartModel(**first.tensors() | mixed | own | errors, n_bands=first.n_bands)
 
 
 def _in_bands(mean: Tensor) -> Tensor:
@@ -323,16 +346,21 @@ def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertai
     numbers, own = torch.tensor(starts.tones) - 1, torch.eye(n, dtype=torch.bool)[:, None].expand_as(base)
     center = torch.isin(numbers, torch.tensor(scene.tones) - 1)
     sets = [center, ~center] if bool((~center).any()) else [center]
-    rows = torch.ones(len(KINDS), 2, len(times), dtype=torch.float64)
+    shape = (len(KINDS), 2, len(times))
+    scale, of_source = (torch.ones(*shape, *rest, dtype=torch.float64) for rest in ((), (n,)))
     share = torch.where(own, *FOLLOWED).sqrt()
-    for row, kind in zip(rows, KINDS, strict=True):
+    for row, kind in enumerate(KINDS):
         error = torch.zeros_like(base)
         for one in sets:
             found = model.transfer(kind, (numbers[one] + 1).tolist(), times)
             mean, stderr = (getattr(starts, name)[one, 1:] for name in (kind, f"{kind}_stderr"))
             followed = share * stderr
-            error += (followed.square() + model_error(found, mean, stderr, followed).square()) / len(sets)
-        for part, factor in zip((own, ~own), row, strict=True):
-            here, there = ((x * part).sum((0, 2)) for x in (error, base))
-            factor.copy_((here / there.clamp(min=1e-30)).sqrt())
-    return StartModel(**model.tensors() | {"scale_times": times, "scale": rows}, n_bands=n)
+            noise = (stderr.square() - followed.square()).sqrt()
+            error += (followed.square() + model_error(found, mean, stderr, noise).square()) / len(sets)
+        for column, part in enumerate((own, ~own)):
+            here, there = ((x * part).sum(2).T for x in (error, base))  # [time, source]
+            scale[row, column] = (here.sum(1) / there.sum(1).clamp(min=LEAST)).sqrt()
+            each = (here / there.clamp(min=LEAST)).sqrt()
+            of_source[row, column] = each / scale[row, column, :, None].clamp(min=LEAST)
+    errors = {"scale_times": times, "scale": scale, "of_source": of_source}
+    return StartModel(**model.tensors() | errors, n_bands=n)

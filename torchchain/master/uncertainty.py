@@ -2,8 +2,9 @@
 
 The error of a predicted energy has two parts. The ensemble is finite: blocks of realizations are drawn again with
 replacement and the model is fitted again (Efron 1979; Kunsch 1989). And the model is not the chain: where it misses
-its own ensemble by more than the ensemble's error explains, the rest, smoothed over neighboring times and bands, is
-counted as the model's own error.
+its own ensemble by more than noise explains, the rest, smoothed over neighboring times and bands, is counted as the
+model's own error. What noise explains is what models of the ensembles drawn again miss these by, beyond what is missed
+of the whole: a fit follows a part of the noise, of every energy another.
 """
 
 from __future__ import annotations
@@ -24,10 +25,12 @@ from torchchain.master.fits import FitWarning
 from torchchain.master.misfit import model_error
 from torchchain.master.model import TransferModel
 from torchchain.master.records import Progress, Recipe
-from torchchain.master.sample import Sample
+from torchchain.master.sample import Sample, block_weights
 
 MOST_TIMES = 64
 """Times at which the errors of predictions are kept."""
+FAR, NORMAL_MEDIAN = 3.0, 0.6745
+"""Deviations from the median that are cut, in standard deviations; the median size of normal ones."""
 AHEAD = 1e4
 """Times beyond the last at which a model is looked at before it is trusted for good, up to so many times that."""
 
@@ -40,6 +43,8 @@ class Uncertainty:
         rates_stderr, basis_stderr: of Q and Pi, [source, receiver].
         times: (time,), some of the calibration's, increasing.
         stderr: of the predicted share of the energy, [source, time, receiver].
+        misfit_share: how much of its square is the model's own error, which more chains would not lessen, in the source's
+            own band and, on average, in others, (part, time, band); None in files that do not know it.
 
     Example:
         >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40)
@@ -52,6 +57,7 @@ class Uncertainty:
     basis_stderr: Tensor
     times: Tensor
     stderr: Tensor
+    misfit_share: Tensor | None = None
 
     def of(self, initial: Tensor, times: Tensor) -> Tensor:
         """Standard error of the prediction from a start, (*batch, time, band).
@@ -63,13 +69,26 @@ class Uncertainty:
             initial: (*batch, band).
             times: (time,).
         """
-        kept, stderr = self.times.to(initial), self.stderr.to(initial)
+        here = self._at(self.stderr.to(initial), times)
+        size = initial.abs().amax(-1, keepdim=True).clamp(min=torch.finfo(initial.dtype).tiny)
+        return torch.einsum("...s,str->...tr", (initial / size).square(), here.square()).sqrt() * size[..., None]
+
+    def _at(self, values: Tensor, times: Tensor) -> Tensor:
+        """Of values [any, time, band], those at other times."""
+        kept = self.times.to(values)
         after = torch.searchsorted(kept, times.contiguous()).clamp(1, len(kept) - 1)
         low, high = kept[after - 1], kept[after]
         weight = ((times - low) / (high - low)).clamp(0, 1)[:, None]
-        here = stderr[:, after - 1] * (1 - weight) + stderr[:, after] * weight
-        size = initial.abs().amax(-1, keepdim=True).clamp(min=torch.finfo(initial.dtype).tiny)
-        return torch.einsum("...s,str->...tr", (initial / size).square(), here.square()).sqrt() * size[..., None]
+        return values[:, after - 1] * (1 - weight) + values[:, after] * weight
+
+    def parts(self, times: Tensor) -> tuple[Tensor, Tensor]:
+        """Variances of the prediction from each band, by the ensemble's noise and by the model's misfit, [source, time, receiver]."""
+        variance = self.of(torch.eye(len(self.rates_stderr)).to(times), times).square()
+        if self.misfit_share is None:
+            return variance, torch.zeros_like(variance)
+        inside, outside = self._at(self.misfit_share.to(times), times).transpose(1, 2)[..., None]
+        misfit = variance * torch.where(_own(variance), inside, outside)
+        return variance - misfit, misfit
 
     def coarsened(self, joined: Tensor) -> Uncertainty:
         """Of wider bands, which ``joined`` (band, wider band) makes of the present ones.
@@ -88,29 +107,41 @@ class Uncertainty:
         return {
             "rates_stderr": self.rates_stderr, "basis_stderr": self.basis_stderr,
             "stderr_times": self.times, "stderr": self.stderr,
+            **({} if self.misfit_share is None else {"misfit_share": self.misfit_share}),
         }  # fmt: skip
 
     @classmethod
     def from_tensors(
-        cls, rates_stderr: Tensor, basis_stderr: Tensor, stderr_times: Tensor, stderr: Tensor
-    ) -> Uncertainty:
+        cls, rates_stderr: Tensor, basis_stderr: Tensor, stderr_times: Tensor, stderr: Tensor,
+        misfit_share: Tensor | None = None,
+    ) -> Uncertainty:  # fmt: skip
         """The inverse of :meth:`tensors`, checked."""
         n, count = len(rates_stderr), len(stderr_times)
-        values = {
-            "rates_stderr": rates_stderr,
-            "basis_stderr": basis_stderr,
-            "stderr_times": stderr_times,
-            "stderr": stderr,
-        }
-        shapes = {"rates_stderr": (n, n), "basis_stderr": (n, n), "stderr_times": (count,), "stderr": (n, count, n)}
+        every = {
+            "rates_stderr": (rates_stderr, (n, n)), "basis_stderr": (basis_stderr, (n, n)),
+            "stderr_times": (stderr_times, (count,)), "stderr": (stderr, (n, count, n)),
+            **({} if misfit_share is None else {"misfit_share": (misfit_share, (2, count, n))}),
+        }  # fmt: skip
         if stderr_times.ndim != 1 or count < 2 or not bool((stderr_times.diff() > 0).all()):
             raise checks.fail("stderr_times", "be at least two increasing times", f"{count} times")
-        for name, value in values.items():
+        for name, (value, shape) in every.items():
             checks.real_tensor(name, value)
-            if tuple(value.shape) != shapes[name]:
-                raise checks.fail(name, f"have shape {shapes[name]}", f"shape {tuple(value.shape)}")
+            if tuple(value.shape) != shape:
+                raise checks.fail(name, f"have shape {shape}", f"shape {tuple(value.shape)}")
             checks.first_bad(name, "not be negative", value, value < 0)
-        return cls(rates_stderr, basis_stderr, stderr_times, stderr)
+        if misfit_share is not None:
+            checks.first_bad("misfit_share", "be at most 1", misfit_share, misfit_share > 1)
+        return cls(rates_stderr, basis_stderr, stderr_times, stderr, misfit_share)
+
+
+def of_parts(rates_stderr: Tensor, basis_stderr: Tensor, times: Tensor, noise: Tensor, misfit: Tensor) -> Uncertainty:
+    """From variances by the ensemble's noise and by the model's misfit, [source, time, receiver]."""
+    variance = noise + misfit
+    share = torch.where(variance > 0, misfit / variance.clamp(min=torch.finfo(variance.dtype).tiny), 0.0).clamp(max=1)
+    inside = share.diagonal(dim1=0, dim2=2)
+    outside = (share.sum(2).T - inside) / max(len(share) - 1, 1)
+    shares = torch.stack([inside, outside]).clamp(0, 1)
+    return Uncertainty(rates_stderr, basis_stderr, times, variance.sqrt().float(), shares.float())
 
 
 def draw_again(
@@ -130,7 +161,7 @@ def draw_again(
         chosen: the model whose own misfit counts, where that is not ``model`` but one as near to the ensemble.
     """
     drawn = block_draws(len(transfer.block_counts), replicates)
-    return combined(transfer, chosen or model, _replicas(transfer, recipe, model, drawn), progress)
+    return combined(transfer, chosen or model, _replicas(transfer, recipe, model, drawn), drawn, progress)
 
 
 def block_draws(blocks: int, replicates: int, ensemble: int = 0) -> Tensor:
@@ -143,26 +174,55 @@ def block_draws(blocks: int, replicates: int, ensemble: int = 0) -> Tensor:
 
 
 def combined(
-    transfer: BandTransfer, model: TransferModel, replicas: Iterable[TransferModel], progress: Progress = None
-) -> Uncertainty:
-    """Standard errors from the spread of models of ensembles drawn again, and from what the model itself misses."""
+    transfer: BandTransfer, model: TransferModel, replicas: Iterable[TransferModel], repeats: Tensor,
+    progress: Progress = None,
+) -> Uncertainty:  # fmt: skip
+    """Standard errors from the spread of models of ensembles drawn again, and from what the model itself misses.
+
+    Args:
+        transfer: what the model was fitted to.
+        model: whose error it is.
+        replicas: the models of the ensembles.
+        repeats: how often each block is in each of them, (replica, block).
+        progress: called with 1 after every one.
+    """
     kept, blocks = kept_times(transfer.times), len(transfer.block_counts)
-    times = transfer.times[kept]
-    rates, bases, paths = [], [], []
-    for other in replicas:
+    times, block_mean = transfer.times[kept], transfer.block_mean[:, :, kept]
+    rates, bases, paths, missed = [], [], [], []
+    for other, weight in zip(replicas, block_weights(transfer, repeats), strict=True):
         rates.append(other.rates.detach())
         bases.append(other.basis)
         paths.append(other.transfer(times).detach())
+        missed.append(paths[-1] - torch.tensordot(weight, block_mean.to(weight), dims=1))
         if progress is not None:
             progress(1)
     # blocks drawn with replacement spread (blocks - 1) / blocks of what independent ensembles do
     scale = math.sqrt(blocks / (blocks - 1))
-    spread = scale * torch.stack(paths).std(0)
-    own = model_error(model.transfer(times).detach(), transfer.mean[:, kept], transfer.stderr[:, kept], spread)
-    return Uncertainty(
-        scale * torch.stack(rates).std(0), scale * torch.stack(bases).std(0), times,
-        (spread.square() + own.square()).sqrt().float(),  # known to a few per cent
-    )  # fmt: skip
+    spread, noise = (scale * winsorized(torch.stack(each)) for each in (paths, missed))
+    own = model_error(model.transfer(times).detach(), transfer.mean[:, kept], transfer.stderr[:, kept], noise)
+    slopes, ends = (scale * torch.stack(each).std(0) for each in (rates, bases))
+    return of_parts(slopes, ends, times, spread.square(), own.square())
+
+
+def winsorized(values: Tensor) -> Tensor:
+    """Standard deviation over the first axis, with deviations cut at ``FAR`` times that of normal ones with their median.
+
+    One fit of twenty that went astray would otherwise count for all (Huber 1964).
+    """
+    off = values - _median(values)
+    most = FAR / NORMAL_MEDIAN * _median(off.abs())
+    return torch.maximum(torch.minimum(off, most), -most).std(0)
+
+
+def _own(values: Tensor) -> Tensor:
+    """Which of [source, time, receiver] are of the source's own band."""
+    return torch.eye(len(values), dtype=torch.bool, device=values.device)[:, None].expand_as(values)
+
+
+def _median(values: Tensor) -> Tensor:
+    """Over the first axis, of an even number the mean of the middle two."""
+    count = len(values)
+    return values.sort(0).values[(count - 1) // 2 : count // 2 + 1].mean(0)
 
 
 def _replicas(transfer: BandTransfer, recipe: Recipe, model: TransferModel, repeats: Tensor) -> Iterator[TransferModel]:
