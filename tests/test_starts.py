@@ -341,7 +341,7 @@ def test_the_error_of_a_virial_is_the_change_of_that_of_a_kick(master):
     zero, one = torch.zeros(N // 2, dtype=torch.float64), torch.zeros(N // 2, dtype=torch.float64)
     one[13] = 1.0
     none = torch.zeros(()).double()
-    kick, virial, both = (tc.StartEnergy(zero, k, g, none) for k, g in ((one, zero), (zero, one), (one, one)))
+    kick, virial, both = (StartEnergy(zero, k, g, none) for k, g in ((one, zero), (zero, one), (one, one)))
     times = torch.tensor([0.7, 3.0, 11.0], dtype=torch.float64)
     before, here, after = (master.standard_error(kick, share * times) for share in (0.8, 1.0, 1.2))
     slope = (after - before) / (0.4 * times[:, None])

@@ -385,17 +385,12 @@ def errors_between(
             missed += by_misfit.sqrt() * scale
             bases += (errors.basis_stderr * late).square()
             slopes += (weight * errors.rates_stderr).square()
-    if guided:
-        less = _shared(_at(scene, known[0]), told, times)
-        noise, missed = noise * less.square(), missed * less
-    misfit = missed.square()
+    less = _shared(_at(scene, known[0]), told, times) if guided else torch.ones_like(here)
+    noise, misfit = noise * less.square(), (missed * less).square()
     if strength not in known and sets > 1:
-        if guided:
-            lower = _below(members[0], told, times, 1)
-        else:
-            lower = between(members, scene, sets - 1, 1, model.guide if len(model.guide) else None).transfer(times)
-        unit = (noise + misfit).sqrt()
-        misfit = misfit + model_error(here, lower.detach(), unit, torch.zeros_like(here)).square()
+        guide = model.guide if len(model.guide) else None
+        lower = _below(members[0], told, times, 1) if guided else between(members, scene, sets - 1, 1, guide).transfer(times)
+        misfit += model_error(here, lower.detach(), (noise + misfit).sqrt(), torch.zeros_like(here)).square()
     return of_parts(slopes.sqrt(), bases.sqrt(), times, noise, misfit)
 
 
