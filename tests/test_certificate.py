@@ -8,6 +8,7 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
+from torchchain.master import nonnegative as nonnegative_fit
 from torchchain.master.certificate import (
     Certificate,
     CertificateError,
@@ -15,6 +16,7 @@ from torchchain.master.certificate import (
     certify,
     verify,
 )
+from torchchain.master.fits import FitWarning
 from torchchain.master.memory import MemoryModel
 from torchchain.master.nonnegative import nonnegative
 
@@ -112,6 +114,26 @@ def test_nonnegative_keeps_a_good_model_and_mends_a_bad_one(small_transfer):
     again, _ = nonnegative(model, times, mean, noise)  # has the early functions twice; nothing to mend
     assert float((again.transfer(times) - model.transfer(times)).abs().max()) < 0.2 * float(noise.max())
     verify(model, certificate)
+
+
+def test_the_nearest_of_several_sets_of_functions_is_taken(small_transfer, monkeypatch):
+    with pytest.warns(FitWarning):
+        free = tc.calibrate(small_transfer, "projection", order=(2, 3), bootstrap=0).model
+    noise = tc.statistical_distance(small_transfer.stderr).mean(0)
+    times, mean = small_transfer.times, small_transfer.mean
+    weight = 1 / noise.clamp(min=1e-5 * float(noise.max()))[1:]
+
+    def off(cuts):
+        monkeypatch.setattr(nonnegative_fit, "CUTS", cuts)
+        model, certificate = nonnegative(free, times, mean, noise)
+        assert certificate.holds
+        return float(((model.transfer(times) - mean)[:, 1:] * weight[:, None]).square().sum().sqrt())
+
+    every = nonnegative_fit.CUTS
+    alone = [off((cut,)) for cut in every]
+    assert off(every) <= nonnegative_fit.NEARLY * min(alone)
+    monkeypatch.setattr(nonnegative_fit, "NEARLY", 0.0)  # none will do at once: all are tried
+    assert off(every) <= 1.001 * min(alone)  # beside the times there are some beyond, which count a little
 
 
 def test_onset_is_the_fourth_power_of_time(small_transfer):
