@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.ensemble.statistics import total_variation
+from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import FitWarning
 from torchchain.master.ladder import MODELS
@@ -27,6 +27,11 @@ AS_GOOD = 1.1
 """Foreseen distance, over that of the nearest model, of a smaller one that takes its place."""
 LARGE = 500
 """Fitted numbers beyond which a model is tried only where no smaller one will do."""
+SURELY, MUCH_AS_FAR = 1.15, 1.03
+"""Foreseen distance, over the noise, in the worst window or at the worst early time, up to which no larger model is looked for;
+where there is none, that over the smallest such."""
+FIRST = 5.0
+"""Time up to which a model is held to every single time, not to windows alone: waves collide once and nothing is averaged yet."""
 SEEN = 128
 """Times at which models are compared with the half that they have not seen."""
 ENOUGH = 1.05
@@ -83,7 +88,8 @@ def select(
 
     As well: within 5 % in total variation, each decade of time counting alike. A model with windows of time will do if,
     fitted to all blocks, it is foreseen to be within ``near`` times the noise in every one, and is taken if no larger
-    one of its like is foreseen to be nearer by more than a tenth, nor one as near that predicts faster. If none will do,
+    one of its like is foreseen to be nearer by more than a tenth, nor one as near that predicts faster; those come first
+    that are within ``SURELY`` times the noise in every window and at every single time up to ``FIRST``. If none will do,
     the nearest is taken; models without windows are tried only where those with are farther than 5 % over all times.
     Models with rates are tried with procedure L. Rungs of different kinds that are tried in any case are fitted side by
     side on as many threads as there are ``workers``, one thread of BLAS each.
@@ -104,25 +110,30 @@ def select(
     halves = total_variation(*means).mean(0)
     weight = decade_weights(times)
     noise = float(halves @ weight)
+    first = (times > 0) & (times <= FIRST)
+    scatter = torch.maximum(halves, 2**0.5 * statistical_distance(transfer.stderr[:, seen]).mean(0))[first]
     tried: list[Rung] = []
     models: list[TransferModel] = []
     chosen: list[Recipe] = []
     enough: dict[int, float] = {}  # foreseen distance of those that will do, by their place among the tried
+    worst: dict[int, float] = {}  # and the largest of any window, and of any early time
     refused: checks.FieldError | None = None
 
     def fitted(recipe: Recipe, sample: Sample, near: TransferModel | None = None) -> tuple[TransferModel, Tensor]:
         model, _ = recipe.run(sample, near, progress)
         return model, model.transfer(times).detach()
 
-    def attempt(candidate: Recipe, known: list[TransferModel]) -> tuple[TransferModel, float, float | None]:
-        """The model, its distance, and that foreseen if it will do."""
+    def attempt(
+        candidate: Recipe, known: list[TransferModel]
+    ) -> tuple[TransferModel, float, tuple[float, float] | None]:
+        """The model, its distance, and that foreseen if it will do: its mean, and the largest."""
         record = _model(candidate)
         like = next((m for m in known[::-1] if record.windows and isinstance(m, record.kind)), None)
         model, found = fitted(candidate, parts[0], like)
         missed = total_variation(found, means[1]).mean(0)
         distance = float(missed @ weight)
         if not record.windows:
-            return model, distance, 1.0 if distance <= ENOUGH * noise else None
+            return model, distance, (1.0, 1.0) if distance <= ENOUGH * noise else None
         if not foreseen(halves, missed, halves) @ weight <= record.near:  # sure to be too far off
             return model, distance, None
         _, other = fitted(candidate, parts[1], model)
@@ -132,7 +143,9 @@ def select(
             float(foreseen(*(part[window].mean() for part in (halves, both, spread))))
             for window in windows(times, record.windows)
         ]
-        return model, distance, sum(ahead) / len(ahead) if max(ahead) <= record.near else None
+        singly = foreseen(halves[first], both[first], spread[first], scatter)
+        far = max(*ahead, float(singly.max()) if len(singly) else 0.0)
+        return model, distance, (sum(ahead) / len(ahead), far) if max(ahead) <= record.near else None
 
     def climb(ladder: list[tuple[int, Recipe]]) -> dict[int, Any]:
         """What became of rungs of one kind, each beginning with the model of the one before, by their place."""
@@ -168,13 +181,15 @@ def select(
                 models.append(model)
                 tried.append(Rung(_model(candidate).name, candidate.order, distance))
                 if ahead is not None:
-                    enough[len(tried) - 1] = ahead
+                    enough[len(tried) - 1], worst[len(tried) - 1] = ahead
             if enough and not _model(batch[0]).windows:
                 break
     if not tried:
         assert refused is not None, "there is at least one candidate"
         raise refused
     if enough:
+        bar = max(SURELY, MUCH_AS_FAR * min(worst.values()))
+        enough = {i: distance for i, distance in enough.items() if worst[i] <= bar}
         good = [i for i, distance in enough.items() if distance <= AS_GOOD * min(enough.values())]
         best = min(good, key=lambda i: (MODELS[tried[i].model].slow, i))
     else:
@@ -187,7 +202,7 @@ def select(
     return chosen[best], Selection(reason, tried[best].distance, noise, tuple(tried)), models[best], spare
 
 
-def foreseen(halves: Tensor, missed: Tensor, spread: Tensor) -> Tensor:
+def foreseen(halves: Tensor, missed: Tensor, spread: Tensor, scatter: Tensor | None = None) -> Tensor:
     """Distance of a model of all blocks from fresh chains, over that of two ensembles.
 
     Errors add in squares: the held-out half is missed by the model's own error, by that of the blocks that it was fitted
@@ -197,9 +212,11 @@ def foreseen(halves: Tensor, missed: Tensor, spread: Tensor) -> Tensor:
         halves: distance of the two halves of the ensemble.
         missed: of a model of one half from the other half.
         spread: of the models of either half.
+        scatter: distance that is expected of halves, where a single time tells too little of it; None for theirs.
     """
     squared = halves.square()
-    return ((missed.square() - (squared + spread.square()) / 4).clamp(min=0) / (squared / 2).clamp(min=1e-300)).sqrt()
+    own = (missed.square() - (squared + spread.square()) / 4).clamp(min=0)
+    return (own / ((halves if scatter is None else scatter).square() / 2).clamp(min=1e-300)).sqrt()
 
 
 def _untested(candidates: list[Recipe]) -> tuple[Recipe, str]:
