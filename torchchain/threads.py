@@ -7,13 +7,36 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from typing import TypeVar
+from typing import Generic, TypeVar, overload
 
 import torch
 from threadpoolctl import threadpool_limits
 
+Owner = TypeVar("Owner")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+class kept_property(Generic[Owner, Result]):
+    """``functools.cached_property`` without its lock: until Python 3.11 objects of one class computed theirs one after the other.
+
+    Two threads that ask for that of one object at the same time may both compute it.
+    """
+
+    def __init__(self, compute: Callable[[Owner], Result]) -> None:
+        self.compute, self.name = compute, compute.__name__
+        self.__doc__ = compute.__doc__
+
+    @overload
+    def __get__(self, owner: None, kind: type) -> kept_property[Owner, Result]: ...
+    @overload
+    def __get__(self, owner: Owner, kind: type) -> Result: ...
+    def __get__(self, owner: Owner | None, kind: type) -> kept_property[Owner, Result] | Result:
+        if owner is None:
+            return self
+        value = self.compute(owner)
+        owner.__dict__[self.name] = value  # where it is looked for first from now on
+        return value
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -28,7 +27,7 @@ from torchchain.network.evolvers import begin
 from torchchain.network.lattices import Lattice
 from torchchain.network.modes import NetworkModes
 from torchchain.network.systems import normal_modes
-from torchchain.threads import single_thread
+from torchchain.threads import kept_property, single_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +53,13 @@ class Chunk:
         assert isinstance(self.system, Chain), "of scenes of chains alone"
         return self.system
 
-    @cached_property
+    @kept_property
     def modes(self) -> NormalModes | NetworkModes:
         """The normal modes, computed once if anything asks for them."""
         with self.stages("eigen-decomposition"):
             return normal_modes(self.system)
 
-    @cached_property
+    @kept_property
     def times(self) -> Tensor:
         return self.scene.times.to(self.layout.device)
 

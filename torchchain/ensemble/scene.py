@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,6 +38,7 @@ from torchchain.network.lattices import Lattice
 from torchchain.network.random_lattices import RandomLattices
 from torchchain.species.energy import species_waves
 from torchchain.species.mixtures import MixedChain, Mixture, Species
+from torchchain.threads import kept_property
 
 System = TypeVar("System", Lattice, MixedChain)
 LARGEST_CHAIN = 10**8
@@ -197,7 +197,7 @@ class Scene(Printed, checks.Fields):
         if (self.contact == "hertz" or self.lattice or self.by_species) and self.energy_definition == "site":
             put("energy_definition", "bond")  # the only one that a Hertz contact has; that of lattices in space
 
-    @cached_property
+    @kept_property
     def mixture(self) -> Mixture | None:
         """What the beads of the scene are of; None for beads of one kind."""
         return Mixture(self.species, self.arrangement, self.unlike) if self.species else None
@@ -212,7 +212,7 @@ class Scene(Printed, checks.Fields):
         """Damping of the contacts, of a mixture the largest; 0 where none is damped."""
         return self.damping if self.mixture is None else self.mixture.largest_damping
 
-    @cached_property
+    @kept_property
     def lattices(self) -> RandomLattices | None:
         """What the lattices of the scene are drawn from; None for chains."""
         if self.lattice is None or self.shape is None:

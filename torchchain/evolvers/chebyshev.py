@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,7 +36,7 @@ from torchchain.evolvers.expansion import LEAP, ROUNDING, SEGMENTS
 from torchchain.evolvers.method import Advance, Method
 from torchchain.modes import phase
 from torchchain.modes.localization import negative_pivots
-from torchchain.threads import side_by_side
+from torchchain.threads import kept_property, side_by_side
 
 if TYPE_CHECKING:
     from torchchain.evolvers.stencil import Propagation, Rows
@@ -255,7 +254,7 @@ class CompiledAdvance:
         self._shape, self._n, self._dtype = state.displacement.shape[:-1], n, state.displacement.dtype
         self._now = 0.0
 
-    @cached_property
+    @kept_property
     def _propagation(self) -> Propagation:
         from torchchain.evolvers import stencil
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from torchchain.master.compact import (
 )
 from torchchain.master.normal import Equations, products
 from torchchain.master.waves import Waves, first_odds
+from torchchain.threads import kept_property
 
 RIDGE = 1.0
 """Against coefficients that the data do not tell, which would run away between the strengths of a family."""
@@ -82,7 +82,7 @@ class Regression:
         """Which products of shapes and clock are coefficients, bool (term, degree)."""
         return products(self.degrees).held
 
-    @cached_property
+    @kept_property
     def equations(self) -> Equations:
         """The linearized problem."""
         size, bands = len(products(self.degrees).heads), np.arange(len(self.odds))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.report import Loss
+from torchchain.threads import kept_property
 
 LEADING = 24
 """Singular vectors of the energies on which poles are searched."""
@@ -82,7 +82,7 @@ class Sample:
         """Energy beyond what stays, T(t) - Pi, as (time, entry)."""
         return (self.mean - basis[:, None]).transpose(0, 1).reshape(len(self.times), -1).numpy()
 
-    @cached_property
+    @kept_property
     def leading(self) -> np.ndarray:
         """Leading right singular vectors of the energies beyond what stays for good, (entry, vector)."""
         kept = self.long_time if self.long_time is not None and not self.damped else torch.zeros_like(self.mean[:, 0])
