@@ -86,6 +86,24 @@ def test_compiling_is_announced_once(monkeypatch, caplog):
     assert [record.getMessage() for record in caplog.records] == ["compiling kernels once, some 20 s ..."]
 
 
+def test_seconds_are_counted_while_kernels_are_compiled(monkeypatch):
+    counted = []
+    monkeypatch.setattr(
+        kernels.time, "sleep", lambda seconds: counted.append(seconds) or kernels.event.end_event("numba:compile")
+    )
+    monkeypatch.setattr(kernels, "IDLE", -1.0)
+    compiling = kernels._Compiling()
+    with kernels.event.install_listener("numba:compile", compiling):
+        kernels.event.start_event("numba:compile")
+        assert not compiling.ended
+        kernels.event.end_event("numba:compile")
+    assert compiling.ended
+    monkeypatch.setattr(kernels, "_Compiling", lambda: compiling)
+    compiling.open = 3  # kernels that others call are compiled within their compilation
+    kernels._count()
+    assert counted == [1.0] * 3
+
+
 def test_a_compiled_kernel_is_at_hand(tmp_path, monkeypatch):
     import importlib.util
 
