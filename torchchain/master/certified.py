@@ -79,8 +79,8 @@ def certified(
             )  # fmt: skip
             return nearest[1:]
         if not spare:
-            other = "" if mend else f", or {how}"
-            warnings.warn(f"{wild}: do not predict other times than it was fitted to{other}", FitWarning, stacklevel=3)
+            hint = "" if mend else f", or {how}"
+            warnings.warn(f"{wild}: do not predict other times than it was fitted to{hint}", FitWarning, stacklevel=3)
     elif not mend and proof.lower < low - ROUNDING:
         warnings.warn(
             f"energies of a model of order {told.order} may go down to {proof.lower:.2g} of the total: {how}",

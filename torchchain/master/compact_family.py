@@ -389,7 +389,11 @@ def errors_between(
     noise, misfit = noise * less.square(), (missed * less).square()
     if strength not in known and sets > 1:
         guide = model.guide if len(model.guide) else None
-        lower = _below(members[0], told, times, 1) if guided else between(members, scene, sets - 1, 1, guide).transfer(times)
+        lower = (
+            _below(members[0], told, times, 1)
+            if guided
+            else between(members, scene, sets - 1, 1, guide).transfer(times)
+        )
         misfit += model_error(here, lower.detach(), (noise + misfit).sqrt(), torch.zeros_like(here)).square()
     return of_parts(slopes.sqrt(), bases.sqrt(), times, noise, misfit)
 
