@@ -212,39 +212,53 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     return figure
 
 
+def cells(shares: xarray.DataArray, errors: xarray.DataArray, other: xarray.DataArray) -> str:
+    """Shares by window in words, with their errors and those of another ensemble."""
+    return "; ".join(
+        f"{name}: {100 * float(a):.0f} +- {100 * float(e):.0f} ({100 * float(b):.0f}) %"
+        for name, a, e, b in zip(window_names(), shares, errors, other, strict=True)
+    )
+
+
 def compare(data: xarray.Dataset, config: Config) -> list[Row]:
     rows = []
     for strength in data.strength.values:
+        here = data.sel(strength=strength)
+        words = ", ".join(f"{float(x):.2f}" for x in here.distance)
+        rows.append(Row(f"xi {float(strength):g}, distance", float(here.distance.mean()), note=words))
         for part in PARTS:
-            here = data.sel(strength=strength, part=part)
-            model, other = (here.sel(predicted_by=name) for name in ("model", "another ensemble"))
-            cells = [
-                f"{name}: {100 * float(a):.0f} +- {100 * float(e):.0f} ({100 * float(b):.0f}) %"
-                for name, a, e, b in zip(window_names(), model.within, model.within_stderr, other.within, strict=True)
-            ]
-            ratio = (
-                f"; distance over an ensemble's {', '.join(f'{float(x):.2f}' for x in here.distance)}"
-                if part == PARTS[0]
-                else ""
-            )
-            rows.append(
-                Row(f"xi {float(strength):g}, {part}", float(model.within.mean()), note="; ".join(cells) + ratio)
-            )
+            model, other = (here.sel(part=part, predicted_by=name) for name in ("model", "another ensemble"))
+            note = cells(model.within, model.within_stderr, other.within)
+            rows.append(Row(f"xi {float(strength):g}, {part}", float(model.within.mean()), note=note))
     return rows
 
 
-def explain(data: xarray.Dataset, config: Config) -> str:
-    model, other = (data.within.sel(predicted_by=name) for name in ("model", "another ensemble"))
-    good = ((model >= WANTED[0]) & (model <= WANTED[1])).values
-    near = np.abs(model.values - np.clip(model.values, *WANTED)) <= data.within_stderr.sel(predicted_by="model").values
+def words(realizations: int) -> str:
+    """What a share is."""
     return (
-        f"measured: share of the energies of a fresh ensemble of {config.realizations} chains (N = {config.n_particles}, {config.n_bands} bands, masses: {config.kind}) within one standard\n"
-        f"error of both, mean over windows; then by window of time, with its standard error and, in brackets, the share of an ensemble's energies within one error of\n"
-        f"another ensemble. Over all pairs of {config.ensembles} ensembles from seed {config.seed} on; errors by leaving out one of them. Energies of a source's own band err alike for all\n"
-        "sources of an ensemble, and at all early times: one pair of ensembles has all of them within one error, or few. Distances: total variation from all other\n"
-        "ensembles, of the model over that of its ensemble.\n"
-        f"In the wanted {100 * WANTED[0]:.0f} to {100 * WANTED[1]:.0f} %: {int(good.sum())} of {good.size} shares of models, {int((good | near).sum())} within a standard error; lowest {100 * float(model.min()):.0f}, highest {100 * float(model.max()):.0f} %; of ensembles "
-        f"{100 * float(other.min()):.0f} to {100 * float(other.max()):.0f} %."
+        f"Shares of the energies of a fresh ensemble of {realizations} chains within one standard error of both, mean over windows; then by window, with its standard\n"
+        "error (by leaving out one ensemble at a time) and, in brackets, the share of an ensemble's energies within one error of another. Energies of the source's own\n"
+        "band err alike for all sources of an ensemble, and at all early times: of one pair of ensembles nearly all lie within one error, or few."
+    )
+
+
+def verdict(data: xarray.Dataset, name: str) -> str:
+    """How many shares are as wanted."""
+    found, other = (data.within.sel(predicted_by=each).values for each in (name, "another ensemble"))
+    off = np.abs(found - np.clip(found, *WANTED))
+    near = off <= data.within_stderr.sel(predicted_by=name).values
+    wanted = f"{100 * WANTED[0]:.0f} to {100 * WANTED[1]:.0f} %"
+    return (
+        f"In the wanted {wanted}: {int((off == 0).sum())} of {found.size} shares, {int(near.sum())} within their standard error;\n"
+        f"lowest {100 * np.nanmin(found):.0f}, highest {100 * np.nanmax(found):.0f} %; of ensembles {100 * np.nanmin(other):.0f} to {100 * np.nanmax(other):.0f} %."
+    )
+
+
+def explain(data: xarray.Dataset, config: Config) -> str:
+    return (
+        f"Distances: total variation from all other ensembles (N = {config.n_particles}, {config.n_bands} bands, masses: {config.kind}), of a model over that of the ensemble it was calibrated on,\n"
+        f"mean over windows and by window ({', '.join(window_names())}).\n{words(config.realizations)}\n"
+        f"Over all pairs of {config.ensembles} ensembles from seed {config.seed} on. {verdict(data, 'model')}"
     )
 
 
