@@ -10,6 +10,7 @@ import torch
 import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.master import Uncertainty
+from torchchain.master.alike import factors
 from torchchain.master.uncertainty import of_parts, winsorized
 
 B = 6
@@ -31,27 +32,39 @@ def ensembles():
     return [ensemble(seed) for seed in SEEDS]
 
 
-def held(found, errors, fresh):
-    """Shares of fresh energies within one error of both, and their errors, (part, window); every pair of different seeds.
+def windows(within):
+    """Means of [start, time, receiver] over starts and receivers in each window."""
+    times = TIMES
+    return torch.stack([within[:, (times > low) & (times <= high)].mean((0, 1, 2)) for low, high in WINDOWS])
 
-    Energies of one ensemble err alike: the error of a share is by leaving out one seed at a time.
+
+def over_pairs(inside):
+    """Mean over pairs (one, other, ...) of different ensembles, and its error by leaving out one at a time.
+
+    Energies of one ensemble err alike: pairs are not independent, and energies less so.
     """
-    times, inside = TIMES, torch.zeros(len(found), len(fresh), 2, len(WINDOWS), dtype=torch.float64)
+    other = (1 - torch.eye(len(inside))).double()
+
+    def mean(kept):
+        weight = other[kept][:, kept]
+        return torch.einsum("ij,ij...->...", weight / weight.sum(), inside[kept][:, kept])
+
+    every = torch.arange(len(inside))
+    left_out = torch.stack([mean(every[every != i]) for i in every])
+    return mean(every), ((len(every) - 1) * left_out.var(0, correction=0)).sqrt()
+
+
+def held(found, errors, fresh):
+    """Shares of fresh energies within one error of both, and their errors, (part, window); every pair of different seeds."""
+    inside = torch.zeros(len(found), len(fresh), 2, len(WINDOWS), dtype=torch.float64)
+    times, own = TIMES, OWN.expand(B, len(TIMES), B)
     for i, j in np.ndindex(*inside.shape[:2]):
         error = errors[i].square() + fresh[j].stderr.square()
         within = ((found[i] - fresh[j].mean).square() <= error).double()
         for w, (low, high) in enumerate(WINDOWS):
-            here = within[:, (times > low) & (times <= high)]
-            own = OWN.expand_as(here)
-            inside[i, j, :, w] = torch.stack([here[own].mean(), here[~own].mean()])
-    other = (1 - torch.eye(len(found))).double()[..., None, None]
-
-    def mean(kept):
-        return (inside * other)[kept][:, kept].sum((0, 1)) / other[kept][:, kept].sum()
-
-    every = torch.arange(len(found))
-    left_out = torch.stack([mean(every[every != i]) for i in every])
-    return mean(every), ((len(every) - 1) * left_out.var(0, correction=0)).sqrt()
+            here = (times > low) & (times <= high)
+            inside[i, j, :, w] = torch.stack([within[:, here][part[:, here]].mean() for part in (own, ~own)])
+    return over_pairs(inside)
 
 
 def test_energies_of_two_ensembles_lie_within_one_error_as_often_as_normal_ones(ensembles):
@@ -71,6 +84,25 @@ def test_energies_of_fresh_chains_lie_within_one_error_of_a_model(ensembles):
     assert bool((narrow < share - 0.05).all())  # the shares do tell of the errors
 
 
+def test_energies_of_mixtures_of_bands_lie_within_one_error_as_often(ensembles):
+    """Neighboring bands err alike, so that their mixture errs more than by independent errors, and all bands together less."""
+    starts = torch.cat([torch.ones(1, B), torch.ones(B, B).triu().tril(2)[: B - 2]]).double()
+    starts = starts / starts.sum(-1, keepdim=True)
+    masters = [tc.calibrate(each) for each in ensembles]
+    found, errors = zip(*((m.solve(starts, TIMES), m.standard_error(starts, TIMES)) for m in masters), strict=True)
+    measured = []
+    for each in ensembles:
+        blocks = torch.einsum("ms,bstr->bmtr", starts, each.block_mean.double())
+        measured.append((blocks.mean(0), blocks.std(0) / len(blocks) ** 0.5))
+    inside = torch.zeros(len(masters), len(masters), len(WINDOWS), dtype=torch.float64)
+    for i, j in np.ndindex(*inside.shape[:2]):
+        mean, stderr = measured[j]
+        inside[i, j] = windows(((found[i] - mean).square() <= errors[i].square() + stderr.square()).double())
+    share, error = over_pairs(inside)
+    assert float(error.max()) < 0.08
+    assert bool(((share - 0.68).abs() < 0.08 + 2 * error).all()), (share, error)
+
+
 def test_between_the_members_of_a_family_they_hold_as_often(ensembles):
     count = 8
     members = ([ensemble(seed, strength) for strength in (0.1, 0.2, 0.4)] for seed in SEEDS[:count])
@@ -85,12 +117,14 @@ def test_between_the_members_of_a_family_they_hold_as_often(ensembles):
 
 def test_one_fit_of_twenty_that_went_astray_does_not_count_for_all():
     values = torch.randn(20, 4000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    plain = winsorized(values)
+    plain, off = winsorized(values)
+    torch.testing.assert_close(off.std(0), plain)
+    torch.testing.assert_close(off.mean(0), torch.zeros(4000).double(), rtol=0, atol=1e-12)
     assert abs(float(plain.square().mean()) - 1) < 0.05  # of normal values next to nothing is cut
     assert float(((plain - values.std(0)).abs() > 1e-12).double().mean()) < 0.3
     values[3] = 1e6
-    assert float(winsorized(values).square().mean()) < 2
-    assert torch.equal(winsorized(torch.ones(5, 3)), torch.zeros(3))
+    assert float(winsorized(values)[0].square().mean()) < 2
+    assert torch.equal(winsorized(torch.ones(5, 3))[0], torch.zeros(3))
 
 
 def test_noise_and_misfit_are_told_apart_at_all_times(tmp_path):
@@ -115,6 +149,38 @@ def test_noise_and_misfit_are_told_apart_at_all_times(tmp_path):
         Uncertainty.from_tensors(**errors.tensors() | {"misfit_share": errors.misfit_share[:1]})
 
 
+def test_factors_are_those_of_errors_that_were_made_with_them():
+    n, count, replicas = 5, 16, 4000
+    draw = torch.Generator().manual_seed(3)
+    part = torch.tensor([0.9, 0.8, 0.0, -0.7, 0.5], dtype=torch.float64)
+    common = torch.randn(replicas, 1, count, n, generator=draw, dtype=torch.float64)
+    alone = torch.randn(replicas, n, count, n, generator=draw, dtype=torch.float64)
+    error = torch.rand(n, count, n, generator=draw, dtype=torch.float64) + 0.5
+    sources = part[None, :, None, None]
+    spread = error * (sources * common + (1 - sources.square()).sqrt() * alone)
+    found = factors(spread, torch.zeros_like(spread), torch.zeros_like(error), error)
+    assert found.shape == (2, n, 8, n)
+    assert float(found.square().sum(0).max()) <= 1 + 1e-12
+    shared = torch.einsum("fsgr,fugr->sugr", found, found)
+    for s, u in ((0, 1), (0, 3), (1, 4), (3, 4)):
+        assert abs(float(shared[s, u].mean() - part[s] * part[u])) < 0.2  # what each has for itself is not quite apart
+    start = torch.tensor([0.5, 0.5, 0.0, 0.0, 0.0], dtype=torch.float64)
+    times = torch.arange(count, dtype=torch.float64)
+    errors = of_parts(error[:, 0], error[:, 0], times, error.square(), 0 * error, found)
+    made = torch.einsum("s,kstr->ktr", start, spread).std(0)
+    told, apart = errors.of(start, times), replace(errors, alike=None).of(start, times)
+    assert float((told / made - 1).abs().max()) < 0.1
+    assert float((apart / made).max()) < 0.85
+
+
+def test_damaged_factors(ensembles):
+    errors = tc.calibrate(ensembles[0], model="compact").uncertainty
+    with pytest.raises(FieldError, match="alike must hold parts of squares up to 1"):
+        Uncertainty.from_tensors(**errors.tensors() | {"alike": errors.alike + 1})
+    with pytest.raises(FieldError, match="alike must have shape"):
+        Uncertainty.from_tensors(**errors.tensors() | {"alike": errors.alike[:, :, :1]})
+
+
 def test_files_without_the_share_of_misfit_are_read(ensembles, tmp_path):
     from safetensors import safe_open
     from safetensors.torch import save_file
@@ -123,12 +189,12 @@ def test_files_without_the_share_of_misfit_are_read(ensembles, tmp_path):
     master.save(tmp_path / "new.safetensors")
     with safe_open(tmp_path / "new.safetensors", "pt") as file:
         header, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    share = tensors.pop("misfit_share")
+    share, _ = tensors.pop("misfit_share"), tensors.pop("alike")
     save_file(tensors, tmp_path / "old.safetensors", header)
     old = tc.MasterEquation.load(tmp_path / "old.safetensors")
-    assert old.uncertainty.misfit_share is None
+    assert old.uncertainty.misfit_share is old.uncertainty.alike is None
     start = torch.eye(B, dtype=torch.float64)
-    assert torch.equal(old.standard_error(start, TIMES), master.standard_error(start, TIMES))
+    torch.testing.assert_close(old.standard_error(start, TIMES), master.standard_error(start, TIMES), rtol=1e-6, atol=0)
     assert torch.equal(tc.MasterEquation.load(tmp_path / "new.safetensors").uncertainty.misfit_share, share)
     save_file({"misfit_share": share}, tmp_path / "bad.safetensors", header)
     with pytest.raises(FieldError, match="must hold the tensors"):

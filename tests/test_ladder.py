@@ -286,8 +286,13 @@ def test_error_bars_of_a_start(small_transfer):
     errors = master.standard_error(torch.eye(small_transfer.n_bands), times)
     assert errors.shape == small_transfer.mean.shape
     mixed = torch.rand(3, small_transfer.n_bands, dtype=torch.float64)
+    apart = replace(master.uncertainty, alike=None)
     expected = torch.einsum("ms,str->mtr", mixed**2, errors**2).sqrt()
-    assert torch.allclose(master.standard_error(mixed, times), expected, rtol=1e-12)
+    assert torch.allclose(apart.of(mixed, times), expected, rtol=1e-12)
+    shared = master.uncertainty.shared(times).numpy()  # of the bands' errors, v: what is shared adds up
+    v = mixed.numpy()[:, :, None, None] * errors.numpy()
+    square = (v**2 * (1 - (shared**2).sum(0))).sum(1) + sum((v * factor).sum(1) ** 2 for factor in shared)
+    np.testing.assert_allclose(master.standard_error(mixed, times).numpy() ** 2, square, rtol=1e-6, atol=1e-30)
     beyond = master.standard_error(mixed, [float(times[-1]), 1e6])
     assert torch.equal(beyond[:, 0], beyond[:, 1])
 

@@ -380,7 +380,8 @@ def test_the_file_holds_both_transfers(master, tmp_path):
         ("starts.released", torch.ones(5).double(), "starts.released must have shape"),
         ("starts.frequency", torch.ones(31).double(), "starts.decay must have shape"),
         ("starts.scale", torch.full((2, 2, 24), -1.0), "starts.scale must hold factors"),
-        ("starts.of_source", torch.ones(2, 2, 3, 8), "starts.of_source must have shape"),
+        ("starts.stderr", torch.ones(2, 8, 3, 8), "starts.stderr must have shape"),
+        ("starts.stderr", torch.full((2, 8, 24, 8), -1.0), "starts.stderr must not be negative"),
         ("starts.kicked", torch.full((10,), torch.nan).double(), "starts.kicked must"),
     ],
 )
@@ -488,11 +489,13 @@ def test_files_without_the_later_tensors_are_read(master, tmp_path):
     master.save(tmp_path / "new.safetensors")
     with safe_open(tmp_path / "new.safetensors", "pt") as file:
         header, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    older = {name: value for name, value in tensors.items() if name not in ("starts.rigid", "starts.onset", "starts.of_source")}
+    older = {name: value for name, value in tensors.items() if name not in ("starts.rigid", "starts.onset", "starts.stderr")}
     save_file(older, tmp_path / "old.safetensors", header)
     starts = tc.MasterEquation.load(tmp_path / "old.safetensors").starts
     assert float(starts.rigid) == float(starts.onset) == 0
-    assert torch.equal(starts.of_source, torch.ones(2, 2, len(starts.scale_times), B).double())
+    assert starts.stderr.shape == (2, B, 0, B)
+    old, new = (tc.MasterEquation.load(tmp_path / f"{name}.safetensors").standard_error(tc.Impulse(), [1.0, 9.0]) for name in ("old", "new"))
+    assert 0.2 < float((old / new).mean()) < 5
     torch.testing.assert_close(starts.transfer("kicked", [1, 9], TIMES).sum(-1), torch.ones(2, 4).double(), rtol=0, atol=1e-12)
     save_file(tensors | {"starts.rigid": torch.tensor(-0.1).double()}, tmp_path / "bad.safetensors", header)
     with pytest.raises(FieldError, match="starts.rigid must be a share of the energy"):

@@ -86,9 +86,8 @@ def between(
 ) -> CompactModel:
     """The model of a scene whose strength may lie between those of members that were fitted together.
 
-    Where the theory of disorder describes the chains, it is what the coefficients differ from it by that is a polynomial; below
-    the lowest strength see :func:`_below`. Elsewhere they go to zero below the lowest as xi^2, for D is perturbation theory,
-    exact in that limit, and what it leaves out is of order xi^2 t. What damped chains have left is a mixture of that of the nearest two strengths.
+    Where the theory of disorder describes the chains, what the coefficients differ from it by is a polynomial; below the lowest
+    strength see :func:`_below`. Elsewhere they go to zero below it as xi^2, for D is perturbation theory, exact in that limit. What damped chains have left is a mixture of that of the nearest two strengths.
 
     Args:
         members: in order of their strengths.
@@ -220,7 +219,8 @@ def fit_together(
     problems = [regression_of(sample, degrees).guided(guide) for sample, guide in zip(samples, guides, strict=True)]
     mixing = _mixing(samples, sets)
     with single_blas_thread():
-        found, told = solve(problems, mixing, _start(problems, mixing, progress), progress, _stiffness(mixing.shape[1]))
+        start = None if guides.any() else _start(problems, mixing, progress)  # what the theory says is near enough
+        found, told = solve(problems, mixing, start, progress, _stiffness(mixing.shape[1]))
     return guides + mixing @ found, CompactReport(
         told["converged"], told["steps"], told["misfit"], degrees, mixing.shape[1]
     )
@@ -339,7 +339,7 @@ def joined(members: Sequence[MasterEquation]) -> list[MasterEquation]:
             before, now = (each.transfer(errors.times).detach() for each in (member.model, model))
             noise, misfit = errors.parts(errors.times)
             off = model_error(now, before, errors.stderr, torch.zeros_like(now))
-            errors = of_parts(errors.rates_stderr, errors.basis_stderr, errors.times, noise, misfit + off.square())
+            errors = of_parts(errors.rates_stderr, errors.basis_stderr, errors.times, noise, misfit + off.square(), errors.alike)
         record = member.calibration
         report = replace(record.report, fit=told, certificate=model.certificate)
         again.append(MasterEquation(model, replace(record, method="logistic", model="compact", report=report), errors))
@@ -363,8 +363,8 @@ def errors_between(
 ) -> Uncertainty | None:
     """Error bars of the model of a scene between those of members: theirs, and by how much interpolation may be off.
 
-    Errors of the odds are those of a mixture of the nearest two strengths': by the noise of their ensembles they are independent; by what models
-    of this form miss they are alike. What interpolation is off by is taken from the distance to a polynomial of sqrt(xi) of one degree less.
+    Errors of the odds are those of a mixture of the nearest two strengths': by noise they are independent, by what models of this form miss
+    alike, and of sources alike as at the nearer. What interpolation is off by is the distance to a polynomial of sqrt(xi) of one degree less.
     """
     held = [(member, member.uncertainty) for member in members if member.uncertainty is not None]
     if len(held) < len(members):
@@ -373,8 +373,9 @@ def errors_between(
     shares = nearest(strength, known)
     guided = strength < known[0] and _described(scene)
     told = _at(scene, max(strength, THEORY_WEAKEST))
-    times = held[shares.index(max(shares))][1].times
-    eye, here = torch.eye(model.n_bands, dtype=torch.float64), model.transfer(times).detach()
+    nearer = held[shares.index(max(shares))][1]
+    times, eye = nearer.times, torch.eye(model.n_bands, dtype=torch.float64)
+    here = model.transfer(times).detach()
     noise, missed, slopes, bases = (torch.zeros_like(x) for x in (here, here, eye, eye))
     for weight, (member, errors) in zip(shares, held, strict=True):
         if weight:
@@ -395,7 +396,7 @@ def errors_between(
             else between(members, scene, sets - 1, 1, guide).transfer(times)
         )
         misfit += model_error(here, lower.detach(), (noise + misfit).sqrt(), torch.zeros_like(here)).square()
-    return of_parts(slopes.sqrt(), bases.sqrt(), times, noise, misfit)
+    return of_parts(slopes.sqrt(), bases.sqrt(), times, noise, misfit, nearer.alike)
 
 
 def _odds_slope(share: Tensor) -> Tensor:

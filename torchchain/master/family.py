@@ -334,7 +334,7 @@ def _combined_loss(losses: Sequence[tuple[float, Loss | None]]) -> Loss | None:
 
 
 def _combined_errors(parts: Sequence[tuple[float, MasterEquation]]) -> Uncertainty | None:
-    """Errors of the weighted sum: by noise those of different members are independent, by misfit alike."""
+    """Errors of the weighted sum: by noise those of different members are independent, by misfit alike; sources err as in the first member."""
     held = [(weight, member.uncertainty) for weight, member in parts if member.uncertainty is not None]
     if len(held) < len(parts):
         return None
@@ -350,4 +350,5 @@ def _combined_errors(parts: Sequence[tuple[float, MasterEquation]]) -> Uncertain
         times,
         torch.stack([weight**2 * noise for weight, noise, _ in split]).sum(0),
         torch.stack([weight * misfit.sqrt() for weight, _, misfit in split]).sum(0).square(),
+        held[0][1].alike,
     )

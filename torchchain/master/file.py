@@ -25,7 +25,7 @@ from torchchain.master.ladder import kinds, methods
 from torchchain.master.model import TransferModel
 from torchchain.master.report import Calibration, Report
 from torchchain.master.starts import StartModel
-from torchchain.master.uncertainty import Uncertainty
+from torchchain.master.uncertainty import LATER, Uncertainty
 
 FORMAT = "torchchain-master-equation"
 FAMILY_FORMAT = "torchchain-master-family"
@@ -45,8 +45,8 @@ LARGEST_FILE = 2**28
 ERROR_AXES = {
     "rates_stderr": ("band", "band"), "basis_stderr": ("band", "band"),
     "stderr_times": ("time",), "stderr": ("band", "time", "band"), "misfit_share": ("part", "time", "band"),
+    "alike": ("factor", "band", "time", "band"),
 }  # fmt: skip
-LATER_ERRORS = ("misfit_share",)
 """Of the error bars, which a file holds all or none of, but for those that older files do not know."""
 LONGEST_AXIS = 128
 """Functions, or times of the error bars."""
@@ -274,7 +274,7 @@ def _model_tensors(
     kind = kinds()[header["kind"]]
     expected = {n: axes for n, axes in kind.axes.items() if n not in kind.optional or prefix + n in names}
     if any(prefix + name in names for name in ERROR_AXES):
-        needed = [n for n in ERROR_AXES if n not in LATER_ERRORS or prefix + n in names]
+        needed = [n for n in ERROR_AXES if n not in LATER or prefix + n in names]
         expected = expected | {name: ERROR_AXES[name] for name in needed}
     if any(name.startswith(prefix + STARTS) for name in names):
         needed = [n for n in StartModel.AXES if n not in StartModel.OPTIONAL or prefix + STARTS + n in names]

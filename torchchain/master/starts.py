@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from itertools import combinations_with_replacement
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,6 +26,7 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.starts import KINDS
 from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.alike import variance
 from torchchain.master.compact import checked_degrees, n_coefficients
 from torchchain.master.logistic import BEYOND, chosen_times, solve
 from torchchain.master.misfit import model_error
@@ -66,21 +66,22 @@ class StartModel(nn.Module):
         scale_times, scale: errors of T and T' over those of the bands' own model, in the source's own band and in others,
             at some times, (start_time,) and (kind, part, start_time); no times if unknown.
         rigid, onset: as of :class:`torchchain.master.tones.Tones`; 0 in files that do not know them.
-        of_source: errors of each source over ``scale``, (kind, part, start_time, band); 1 in files that do not know them.
+        stderr: errors of T and T' at these times, [kind, source, start_time, receiver]; of no times in files that have
+            ``scale`` alone.
     """
 
     AXES: ClassVar[dict[str, tuple[str, ...]]] = {
         "degrees": ("degree",), "released": ("term",), "kicked": ("term",), "frequency": ("start_tone",), "decay": ("start_tone",),
         "coupling": (), "scale_times": ("start_time",), "scale": ("kind", "part", "start_time"), "rigid": (), "onset": (),
-        "of_source": ("kind", "part", "start_time", "band"),
+        "stderr": ("kind", "band", "error_time", "band"),
     }  # fmt: skip
     SHARES: ClassVar[tuple[str, ...]] = ("rigid", "onset")
-    OPTIONAL: ClassVar[tuple[str, ...]] = (*SHARES, "of_source")
+    OPTIONAL: ClassVar[tuple[str, ...]] = (*SHARES, "stderr")
 
     def __init__(
         self, degrees: Tensor, released: Tensor, kicked: Tensor, frequency: Tensor, decay: Tensor, coupling: Tensor,
         scale_times: Tensor, scale: Tensor, n_bands: int, rigid: Tensor | None = None, onset: Tensor | None = None,
-        of_source: Tensor | None = None,
+        stderr: Tensor | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         degrees = checks.real_tensor("starts.degrees", degrees)
@@ -91,7 +92,7 @@ class StartModel(nn.Module):
             "decay": (decay, (count,)), "coupling": (coupling, ()), "scale_times": (scale_times, (len(scale_times),)),
             "scale": (scale, (2, 2, len(scale_times))),
             **{name: (coupling.new_zeros(()) if x is None else x, ()) for name, x in (("rigid", rigid), ("onset", onset))},
-            "of_source": (scale[..., None].new_ones(*scale.shape, n_bands) if of_source is None else of_source, (2, 2, len(scale_times), n_bands)),
+            "stderr": (coupling.new_zeros(2, n_bands, 0, n_bands) if stderr is None else stderr, (2, n_bands, 0 if stderr is None else len(scale_times), n_bands)),
         }  # fmt: skip
         for name, (value, shape) in shapes.items():
             value = checks.real_tensor(f"starts.{name}", value).double()
@@ -106,14 +107,12 @@ class StartModel(nn.Module):
         self.kicked: Tensor
         self.scale_times: Tensor
         self.scale: Tensor
-        self.of_source: Tensor
+        self.stderr: Tensor
         if not count or count % n_bands:
             raise checks.fail("starts.frequency", f"hold tones of {n_bands} bands alike", count)
-        if (
-            not bool((self.scale >= 0).all())
-            or not bool((self.of_source >= 0).all())
-            or not bool((self.scale_times.diff() > 0).all())
-        ):
+        if not bool((self.stderr >= 0).all()):
+            raise checks.fail("starts.stderr", "not be negative", float(self.stderr.min()))
+        if not bool((self.scale >= 0).all()) or not bool((self.scale_times.diff() > 0).all()):
             raise checks.fail("starts.scale", "hold factors at increasing times", "others")
         self.n_bands = n_bands
 
@@ -125,7 +124,8 @@ class StartModel(nn.Module):
     def tensors(self) -> dict[str, Tensor]:
         """All that makes the model but ``n_bands``, as its constructor takes it."""
         degrees = self.released.new_tensor(self.degrees)
-        return {"degrees": degrees, **{name: getattr(self, name) for name in self.AXES if name != "degrees"}}
+        every = {name: getattr(self, name) for name in self.AXES if name != "degrees"}
+        return {"degrees": degrees, **every, "stderr": self.stderr.float()}
 
     @property
     def n_parameters(self) -> int:
@@ -198,8 +198,8 @@ class StartModel(nn.Module):
     def standard_error(self, start: StartEnergy, times: Tensor, uncertainty: Uncertainty) -> Tensor:
         """Standard error of :meth:`solve`, (*batch, time, band), from that of the bands' own model.
 
-        Tones of one band have the same error, released or kicked, whose derivative by time is that of the virial's part,
-        and bands have errors of their own.
+        Tones of one band have the same error, released or kicked, whose derivative by time is that of the virial's part;
+        those of bands are alike as in the bands' own model.
         """
         self.check(start)
         times = times.to(self.released)
@@ -210,24 +210,21 @@ class StartModel(nn.Module):
         before, after = (1 - NEARBY) * times, (1 + NEARBY) * times
         change = self._errors(1, after, uncertainty) - self._errors(1, before, uncertainty)
         errors.append(change / (after - before).clamp(min=torch.finfo(times.dtype).tiny)[:, None])
-        total = self.released.new_zeros(*start.rigid.shape, len(times), self.n_bands)
-        for i, j in combinations_with_replacement(range(len(errors)), 2):
-            both = energies[i] * energies[j] * (1 + (i != j))
-            total = total + torch.einsum("...s,str->...tr", both, errors[i] * errors[j])
-        return total.clamp(min=0).sqrt()
+        pairs = list(zip(energies, errors, strict=True))
+        return variance(pairs, uncertainty.shared(times)).sqrt()
 
     def _errors(self, row: int, times: Tensor, uncertainty: Uncertainty) -> Tensor:
-        """Standard error of T or T', [source, time, receiver]."""
-        each = uncertainty.of(torch.eye(self.n_bands).to(times), times)
-        if not len(self.scale_times):
-            return each
-        own = torch.eye(self.n_bands, device=times.device)[:, None].expand_as(each) > 0
-        factors = self.scale[row, :, :, None] * self.of_source[row]  # [part, time, source]
-        after = torch.searchsorted(self.scale_times, times.contiguous()).clamp(1, len(self.scale_times) - 1)
-        low, high = self.scale_times[after - 1], self.scale_times[after]
-        weight = ((times - low) / (high - low)).clamp(0, 1)[:, None]
-        inside, outside = torch.lerp(factors[:, after - 1], factors[:, after], weight).transpose(1, 2)[..., None]
-        return each * torch.where(own, inside, outside)
+        """Standard error of T or T', [source, time, receiver]; before the first known time it grows as t^2."""
+        known = self.scale_times
+        if not self.stderr.shape[2]:  # as a factor to that of the bands' own model, in older files
+            each = uncertainty.at(times)
+            if not len(known):
+                return each
+            own = torch.eye(self.n_bands, device=times.device)[:, None].expand_as(each) > 0
+            inside, outside = (_between(known, self.scale[row, part][None, :, None], times) for part in range(2))
+            return each * torch.where(own, inside, outside)
+        early = (times / known[0]).clamp(max=1).square()
+        return _between(known, self.stderr[row], times) * early[:, None]
 
     def check(self, start: StartEnergy) -> None:
         """An error for a start on rings of another length."""
@@ -235,6 +232,15 @@ class StartModel(nn.Module):
             raise checks.fail(
                 "initial", f"be a start on {self.n_particles} particles, as calibrated", start.n_particles
             )
+
+
+def _between(known: Tensor, values: Tensor, times: Tensor) -> Tensor:
+    """Of values [any, known time, any], those at other times: between the nearest two, and beyond the ends the last."""
+    if len(known) == 1:
+        return values.expand(-1, len(times), -1)
+    after = torch.searchsorted(known, times.contiguous()).clamp(1, len(known) - 1)
+    weight = ((times - known[after - 1]) / (known[after] - known[after - 1])).clamp(0, 1)[:, None]
+    return torch.lerp(values[:, after - 1], values[:, after], weight.to(values))
 
 
 def can_fit(transfer: BandTransfer) -> bool:
@@ -314,9 +320,9 @@ def between(lower: tuple[float, StartModel], upper: tuple[float, StartModel], sc
     part, tones = math.log(scene.disorder.strength / low) / math.log(high / low), _tones(scene)
     mixed = {kind: torch.lerp(getattr(first, kind), getattr(last, kind), part) for kind in KINDS}
     own = {name: getattr(tones, name) for name in ("frequency", "decay", "coupling", "rigid", "onset")}
-    every = torch.maximum(*(model.scale[..., None] * model.of_source for model in (first, last)))
-    scale = torch.maximum(first.scale, last.scale)
-    errors = {"scale": scale, "of_source": every / scale[..., None].clamp(min=LEAST)}
+    errors = {"scale": torch.maximum(first.scale, last.scale)}
+    if first.stderr.shape == last.stderr.shape:
+        errors["stderr"] = torch.maximum(first.stderr, last.stderr)
     return StartModel(**first.tensors() | mixed | own | errors, n_bands=first.n_bands)
 
 
@@ -342,12 +348,11 @@ def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertai
     assert starts is not None, "the model was fitted to them"
     assert scene is not None, "and of these chains"
     times, n = starts.times[1:], scene.n_bands
-    base = uncertainty.of(torch.eye(n, dtype=torch.float64), times).square()
+    base = uncertainty.at(times.double()).square()
     numbers, own = torch.tensor(starts.tones) - 1, torch.eye(n, dtype=torch.bool)[:, None].expand_as(base)
     center = torch.isin(numbers, torch.tensor(scene.tones) - 1)
     sets = [center, ~center] if bool((~center).any()) else [center]
-    shape = (len(KINDS), 2, len(times))
-    scale, of_source = (torch.ones(*shape, *rest, dtype=torch.float64) for rest in ((), (n,)))
+    scale, stderrs = torch.ones(len(KINDS), 2, len(times), dtype=torch.float64), []
     share = torch.where(own, *FOLLOWED).sqrt()
     for row, kind in enumerate(KINDS):
         error = torch.zeros_like(base)
@@ -357,10 +362,9 @@ def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertai
             followed = share * stderr
             noise = (stderr.square() - followed.square()).sqrt()
             error += (followed.square() + model_error(found, mean, stderr, noise).square()) / len(sets)
+        stderrs.append(error.sqrt().float().double())  # known to a few per cent
         for column, part in enumerate((own, ~own)):
-            here, there = ((x * part).sum(2).T for x in (error, base))  # [time, source]
-            scale[row, column] = (here.sum(1) / there.sum(1).clamp(min=LEAST)).sqrt()
-            each = (here / there.clamp(min=LEAST)).sqrt()
-            of_source[row, column] = each / scale[row, column, :, None].clamp(min=LEAST)
-    errors = {"scale_times": times, "scale": scale, "of_source": of_source}
+            here, there = ((x * part).sum((0, 2)) for x in (error, base))
+            scale[row, column] = (here / there.clamp(min=LEAST)).sqrt()
+    errors = {"scale_times": times, "scale": scale, "stderr": torch.stack(stderrs)}
     return StartModel(**model.tensors() | errors, n_bands=n)

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.alike import factors, group_of, variance
 from torchchain.master.fits import FitWarning
 from torchchain.master.misfit import model_error
 from torchchain.master.model import TransferModel
@@ -29,6 +30,8 @@ from torchchain.master.sample import Sample, block_weights
 
 MOST_TIMES = 64
 """Times at which the errors of predictions are kept."""
+LATER = ("misfit_share", "alike")
+"""What older files do not know."""
 FAR, NORMAL_MEDIAN = 3.0, 0.6745
 """Deviations from the median that are cut, in standard deviations; the median size of normal ones."""
 AHEAD = 1e4
@@ -45,6 +48,8 @@ class Uncertainty:
         stderr: of the predicted share of the energy, [source, time, receiver].
         misfit_share: how much of its square is the model's own error, which more chains would not lessen, in the source's
             own band and, on average, in others, (part, time, band); None in files that do not know it.
+        alike: part of each standard error that is one with those of other sources, [factor, source, group of times,
+            receiver], see :mod:`torchchain.master.alike`; None where the errors of sources are taken as independent.
 
     Example:
         >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40)
@@ -58,20 +63,32 @@ class Uncertainty:
     times: Tensor
     stderr: Tensor
     misfit_share: Tensor | None = None
+    alike: Tensor | None = None
 
     def of(self, initial: Tensor, times: Tensor) -> Tensor:
         """Standard error of the prediction from a start, (*batch, time, band).
 
-        The errors of different sources are taken as independent; between the kept times they are interpolated, and
-        beyond the last they stay.
+        Between the kept times errors are interpolated, and beyond the last they stay.
 
         Args:
             initial: (*batch, band).
             times: (time,).
         """
-        here = self._at(self.stderr.to(initial), times)
+        here = self.at(times).to(initial)
         size = initial.abs().amax(-1, keepdim=True).clamp(min=torch.finfo(initial.dtype).tiny)
-        return torch.einsum("...s,str->...tr", (initial / size).square(), here.square()).sqrt() * size[..., None]
+        return variance([(initial / size, here)], self.shared(times)).sqrt() * size[..., None]
+
+    def shared(self, times: Tensor) -> Tensor | None:
+        """``alike`` at other times, [factor, source, time, receiver]."""
+        if self.alike is None:
+            return None
+        kept = self.times.to(times)
+        nearest = torch.searchsorted((kept[1:] + kept[:-1]) / 2, times.contiguous())
+        return self.alike.to(times)[:, :, group_of(len(kept)).to(nearest)[nearest]]
+
+    def at(self, times: Tensor) -> Tensor:
+        """Standard error of the prediction from each band, [source, time, receiver]."""
+        return self._at(self.stderr.to(times), times)
 
     def _at(self, values: Tensor, times: Tensor) -> Tensor:
         """Of values [any, time, band], those at other times."""
@@ -83,37 +100,40 @@ class Uncertainty:
 
     def parts(self, times: Tensor) -> tuple[Tensor, Tensor]:
         """Variances of the prediction from each band, by the ensemble's noise and by the model's misfit, [source, time, receiver]."""
-        variance = self.of(torch.eye(len(self.rates_stderr)).to(times), times).square()
+        every = self.at(times).square()
         if self.misfit_share is None:
-            return variance, torch.zeros_like(variance)
+            return every, torch.zeros_like(every)
         inside, outside = self._at(self.misfit_share.to(times), times).transpose(1, 2)[..., None]
-        misfit = variance * torch.where(_own(variance), inside, outside)
-        return variance - misfit, misfit
+        misfit = every * torch.where(_own(every), inside, outside)
+        return every - misfit, misfit
 
     def coarsened(self, joined: Tensor) -> Uncertainty:
         """Of wider bands, which ``joined`` (band, wider band) makes of the present ones.
 
-        Errors of sources are independent, as in :meth:`of`. Those of receivers may be the same error of the model, and
-        add up: the standard errors are upper bounds.
+        Errors of sources are alike as in :meth:`of`. Those of receivers may be the same error of the model, and add up:
+        the standard errors are upper bounds. Wider bands are taken to err independently.
         """
-        mean = (joined / joined.sum(0)).T.square()
+        mean = (joined / joined.sum(0)).T
+        alike = self.shared(self.times)
+        alike = None if alike is None else alike.to(joined) @ joined / joined.sum(0)
 
-        def wider(error: Tensor) -> Tensor:
-            return torch.tensordot(mean, (error.to(joined) @ joined).square(), dims=1).sqrt()
+        def wider(error: Tensor, alike: Tensor | None = None) -> Tensor:
+            return variance([(mean, error.to(joined) @ joined)], alike).sqrt()
 
-        return Uncertainty(wider(self.rates_stderr), wider(self.basis_stderr), self.times, wider(self.stderr))
+        rates, basis = (wider(error[:, None])[:, 0] for error in (self.rates_stderr, self.basis_stderr))
+        return Uncertainty(rates, basis, self.times, wider(self.stderr, alike))
 
     def tensors(self) -> dict[str, Tensor]:
         return {
             "rates_stderr": self.rates_stderr, "basis_stderr": self.basis_stderr,
             "stderr_times": self.times, "stderr": self.stderr,
-            **({} if self.misfit_share is None else {"misfit_share": self.misfit_share}),
+            **{name: value for name in LATER if (value := getattr(self, name)) is not None},
         }  # fmt: skip
 
     @classmethod
     def from_tensors(
         cls, rates_stderr: Tensor, basis_stderr: Tensor, stderr_times: Tensor, stderr: Tensor,
-        misfit_share: Tensor | None = None,
+        misfit_share: Tensor | None = None, alike: Tensor | None = None,
     ) -> Uncertainty:  # fmt: skip
         """The inverse of :meth:`tensors`, checked."""
         n, count = len(rates_stderr), len(stderr_times)
@@ -121,6 +141,7 @@ class Uncertainty:
             "rates_stderr": (rates_stderr, (n, n)), "basis_stderr": (basis_stderr, (n, n)),
             "stderr_times": (stderr_times, (count,)), "stderr": (stderr, (n, count, n)),
             **({} if misfit_share is None else {"misfit_share": (misfit_share, (2, count, n))}),
+            **({} if alike is None else {"alike": (alike, (len(alike), n, int(group_of(count)[-1]) + 1, n))}),
         }  # fmt: skip
         if stderr_times.ndim != 1 or count < 2 or not bool((stderr_times.diff() > 0).all()):
             raise checks.fail("stderr_times", "be at least two increasing times", f"{count} times")
@@ -128,20 +149,32 @@ class Uncertainty:
             checks.real_tensor(name, value)
             if tuple(value.shape) != shape:
                 raise checks.fail(name, f"have shape {shape}", f"shape {tuple(value.shape)}")
-            checks.first_bad(name, "not be negative", value, value < 0)
+            if name != "alike":
+                checks.first_bad(name, "not be negative", value, value < 0)
+            else:
+                checks.first_bad(
+                    name, "hold parts of squares up to 1", value, value.square().sum(0).expand_as(value) > 1 + 1e-5
+                )
         if misfit_share is not None:
             checks.first_bad("misfit_share", "be at most 1", misfit_share, misfit_share > 1)
-        return cls(rates_stderr, basis_stderr, stderr_times, stderr, misfit_share)
+        return cls(rates_stderr, basis_stderr, stderr_times, stderr, misfit_share, alike)
 
 
-def of_parts(rates_stderr: Tensor, basis_stderr: Tensor, times: Tensor, noise: Tensor, misfit: Tensor) -> Uncertainty:
+def of_parts(
+    rates_stderr: Tensor,
+    basis_stderr: Tensor,
+    times: Tensor,
+    noise: Tensor,
+    misfit: Tensor,
+    alike: Tensor | None = None,
+) -> Uncertainty:
     """From variances by the ensemble's noise and by the model's misfit, [source, time, receiver]."""
-    variance = noise + misfit
-    share = torch.where(variance > 0, misfit / variance.clamp(min=torch.finfo(variance.dtype).tiny), 0.0).clamp(max=1)
+    both = noise + misfit
+    share = torch.where(both > 0, misfit / both.clamp(min=torch.finfo(both.dtype).tiny), 0.0).clamp(max=1)
     inside = share.diagonal(dim1=0, dim2=2)
     outside = (share.sum(2).T - inside) / max(len(share) - 1, 1)
     shares = torch.stack([inside, outside]).clamp(0, 1)
-    return Uncertainty(rates_stderr, basis_stderr, times, variance.sqrt().float(), shares.float())
+    return Uncertainty(rates_stderr, basis_stderr, times, both.sqrt().float(), shares.float(), alike)
 
 
 def draw_again(
@@ -198,20 +231,23 @@ def combined(
             progress(1)
     # blocks drawn with replacement spread (blocks - 1) / blocks of what independent ensembles do
     scale = math.sqrt(blocks / (blocks - 1))
-    spread, noise = (scale * winsorized(torch.stack(each)) for each in (paths, missed))
-    own = model_error(model.transfer(times).detach(), transfer.mean[:, kept], transfer.stderr[:, kept], noise)
+    spread, noise = ([scale * x for x in winsorized(torch.stack(each))] for each in (paths, missed))
+    found, mean = model.transfer(times).detach(), transfer.mean[:, kept]
+    own = model_error(found, mean, transfer.stderr[:, kept], noise[0])
     slopes, ends = (scale * torch.stack(each).std(0) for each in (rates, bases))
-    return of_parts(slopes, ends, times, spread.square(), own.square())
+    alike = factors(spread[1], noise[1], found - mean, (spread[0].square() + own.square()).sqrt()).float()
+    return of_parts(slopes, ends, times, spread[0].square(), own.square(), alike)
 
 
-def winsorized(values: Tensor) -> Tensor:
-    """Standard deviation over the first axis, with deviations cut at ``FAR`` times that of normal ones with their median.
+def winsorized(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviation over the first axis, and deviations from the mean: cut at ``FAR`` times those of normal values with their median.
 
     One fit of twenty that went astray would otherwise count for all (Huber 1964).
     """
     off = values - _median(values)
     most = FAR / NORMAL_MEDIAN * _median(off.abs())
-    return torch.maximum(torch.minimum(off, most), -most).std(0)
+    off = torch.maximum(torch.minimum(off, most), -most)
+    return off.std(0), off - off.mean(0)
 
 
 def _own(values: Tensor) -> Tensor:
