@@ -137,14 +137,14 @@ class Uncertainty:
     ) -> Uncertainty:  # fmt: skip
         """The inverse of :meth:`tensors`, checked."""
         n, count = len(rates_stderr), len(stderr_times)
+        if stderr_times.ndim != 1 or count < 2 or not bool((stderr_times.diff() > 0).all()):
+            raise checks.fail("stderr_times", "be at least two increasing times", f"{count} times")
         every = {
             "rates_stderr": (rates_stderr, (n, n)), "basis_stderr": (basis_stderr, (n, n)),
             "stderr_times": (stderr_times, (count,)), "stderr": (stderr, (n, count, n)),
             **({} if misfit_share is None else {"misfit_share": (misfit_share, (2, count, n))}),
             **({} if alike is None else {"alike": (alike, (len(alike), n, int(group_of(count)[-1]) + 1, n))}),
         }  # fmt: skip
-        if stderr_times.ndim != 1 or count < 2 or not bool((stderr_times.diff() > 0).all()):
-            raise checks.fail("stderr_times", "be at least two increasing times", f"{count} times")
         for name, (value, shape) in every.items():
             checks.real_tensor(name, value)
             if tuple(value.shape) != shape:
