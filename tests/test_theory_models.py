@@ -1,5 +1,6 @@
 """The theory as a reduced model, and the corrected theory: exact properties, file, selection, and distance from fresh chains."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -7,8 +8,9 @@ import torch
 
 import torchchain as tc
 from torchchain.checks import FieldError
-from torchchain.master import TheoryModel
+from torchchain.master import TheoryModel, theory_rings
 from torchchain.master.compact import n_coefficients
+from torchchain.master.derived import foresee
 from torchchain.master.selection import rungs
 
 F64 = torch.float64
@@ -143,6 +145,27 @@ def test_tensors_that_make_no_model_are_refused(name, value, words):
 @pytest.mark.parametrize(("n_particles", "n_bands", "tried"), [(32, 4, False), (64, 4, False), (64, 8, True)])
 def test_selection_tries_the_theory_where_it_was_compared_with_chains(n_particles, n_bands, tried):
     scene = tc.Scene(n_particles=n_particles, n_bands=n_bands, realizations=8, times=[0.0, 1.0, 2.0, 8.0, 20.0])
-    found = [recipe.model.name for recipe in rungs(tc.Recipe(None, None, (0.5, 2.0)), tc.band_transfer(scene, starts=False))]
+    found = [
+        recipe.model.name for recipe in rungs(tc.Recipe(None, None, (0.5, 2.0)), tc.band_transfer(scene, starts=False))
+    ]
     assert ("theory" in found) is tried
     assert ("corrected_theory" in found) is tried
+
+
+def test_what_a_selection_asks_of_the_theory_is_computed_once_and_ahead(transfer, monkeypatch):
+    asked, compute = [], theory_rings.transfer_of_law
+
+    def counted(law, waves, times):
+        asked.append(times)
+        return compute(law, waves, times)
+
+    monkeypatch.setattr(theory_rings, "_kept", {})
+    monkeypatch.setattr(theory_rings, "transfer_of_law", counted)
+    with ThreadPoolExecutor(2) as pool:  # one waits for the other's
+        list(pool.map(foresee, [SCENE, SCENE]))
+    assert len(asked) == 1
+    tc.calibrate(transfer, bootstrap=0)
+    assert len(asked) == 1
+    for other in (replace(SCENE, realizations=2), replace(SCENE, n_bands=4), replace(SCENE, boundary="fixed")):
+        foresee(other)
+    assert len(asked) == 1

@@ -2,7 +2,9 @@
 
 import threading
 
-from torchchain.threads import kept_property
+import pytest
+
+from torchchain.threads import kept_property, map_in_order, meanwhile
 
 
 def test_kept_properties_of_two_objects_are_computed_at_once():
@@ -24,3 +26,35 @@ def test_kept_properties_of_two_objects_are_computed_at_once():
     assert [one.__dict__["value"] for one in pair] == [thread.ident for thread in threads]
     assert pair[0].value == threads[0].ident  # not computed again, which would break the barrier
     assert Slow.value.__doc__ == "Told."
+
+
+def test_other_work_begins_with_the_first_result_and_ends_before_what_follows():
+    seen, begun = [], threading.Event()
+
+    def other():
+        begun.set()
+        seen.append("other")
+
+    with meanwhile(other, 2):
+        assert not begun.wait(0.05)
+        for i in map_in_order(abs, range(4), 2):
+            assert begun.wait(20)
+            if i == 0:
+                seen.append("first")
+    assert sorted(seen) == ["first", "other"]
+
+
+def test_other_work_is_not_done_where_nothing_is_mapped_or_something_fails():
+    seen = []
+    with meanwhile(lambda: seen.append("unwanted"), 2):
+        pass
+    with pytest.raises(ZeroDivisionError), meanwhile(lambda: seen.append("unwanted"), 2):
+        raise ZeroDivisionError
+    with meanwhile(lambda: seen.append("unwanted"), 1):
+        list(map_in_order(abs, range(4), 2))
+    assert not [
+        thread
+        for thread in threading.enumerate()
+        if thread.name.startswith("torchchain") and not thread.join(20) and thread.is_alive()
+    ]
+    assert seen == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,6 +16,8 @@ from threadpoolctl import threadpool_limits
 Owner = TypeVar("Owner")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+_waiting: list[threading.Event] = []
+"""Works of :func:`meanwhile` that have not been told to begin."""
 
 
 class kept_property(Generic[Owner, Result]):
@@ -82,6 +85,38 @@ def beside(work: Callable[[], Result], workers: int) -> Iterator[Callable[[], Re
     pool.shutdown()
 
 
+@contextmanager
+def meanwhile(work: Callable[[], object], workers: int) -> Iterator[None]:
+    """Do other work on a thread of one core as soon as :func:`map_in_order` has given a first result, while it goes on.
+
+    Until then what it maps needs Python's one lock to begin, and other work would hold it. Not done with one worker, or where
+    nothing is mapped.
+    """
+    if workers <= 1:
+        yield
+        return
+    under_way, wanted = threading.Event(), True
+
+    def alone() -> None:
+        under_way.wait()
+        if wanted:
+            torch.set_num_threads(1)
+            work()
+
+    thread = threading.Thread(target=alone, name="torchchain meanwhile", daemon=True)
+    thread.start()
+    _waiting.append(under_way)
+    try:
+        yield
+        wanted = under_way.is_set()
+        under_way.set()
+        thread.join()
+    finally:  # of what failed nobody wants the rest
+        wanted = False
+        under_way.set()
+        _waiting.remove(under_way)
+
+
 def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
     """Results of ``work`` in the order of the items, on several threads of one core each.
 
@@ -106,15 +141,22 @@ def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], workers:
         for item in items:
             waiting.append(pool.submit(work, item))
             if len(waiting) > workers:
-                yield waiting.popleft().result()
+                yield _first(waiting)
         while waiting:
-            yield waiting.popleft().result()
+            yield _first(waiting)
     except (KeyboardInterrupt, GeneratorExit):
         wait = False  # nobody wants what is under way
         raise
     finally:
         pool.shutdown(wait=wait, cancel_futures=True)
         torch.set_num_threads(before)
+
+
+def _first(waiting: deque[Future[Result]]) -> Result:
+    found = waiting.popleft().result()
+    for under_way in _waiting:
+        under_way.set()
+    return found
 
 
 def ranges(count: int, workers: int) -> list[tuple[int, int]]:

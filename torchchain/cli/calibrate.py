@@ -29,10 +29,11 @@ from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import Calibration, MasterEquation, calibrate
 from torchchain.master.calibration import recipe
+from torchchain.master.derived import foresee
 from torchchain.master.ladder import methods
 from torchchain.progress import log
 from torchchain.results import read_transfer
-from torchchain.threads import beside
+from torchchain.threads import beside, meanwhile
 
 DATA = "transfer.nc"
 
@@ -60,9 +61,10 @@ def run_calibrate(
             _leave(run, transfer, settings, starts, None, source, shown)
         return
     scene = scene_of(config, flags)
-    recipe(scene, **settings)  # before the ensemble is computed
+    asked = recipe(scene, **settings)  # before the ensemble is computed
     shown = sources_of(flags.show, scene.n_bands)
-    with running(flags, arguments, loaded, options, keep) as run:
+    ahead = partial(foresee, scene) if asked.model is None else lambda: None
+    with running(flags, arguments, loaded, options, keep) as run, meanwhile(ahead, torch.get_num_threads()):
         found = run.measured(partial(band_transfer, starts=starts), scene)
         if found is not None:
             assert found.scene is not None, "of a simulation"

@@ -24,7 +24,7 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.scene_file import TIMES, read_toml
 from torchchain.ensemble.stages import Stages
 from torchchain.evolvers import METHODS
-from torchchain.threads import beside
+from torchchain.threads import meanwhile
 
 Measured = TypeVar("Measured")
 
@@ -69,7 +69,7 @@ class Run:
 
     def measured(self, measure: Callable[..., Measured], scene: Scene) -> Measured | None:
         """What :func:`simulate` or :func:`band_transfer` finds, on the first of the processes that share the work."""
-        with beside(outputs.load, torch.get_num_threads()), ranks.process_group(self.device) as self.group:
+        with meanwhile(outputs.load, torch.get_num_threads()), ranks.process_group(self.device) as self.group:
             before = time.time()
             found = measure(
                 scene, self.flags.method, device=self.device, progress=True, stages=self.stages, options=self.options,

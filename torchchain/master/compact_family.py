@@ -29,13 +29,14 @@ from torchchain.master.compact_record import (
     regression_of,
     shares_of,
 )
-from torchchain.master.derived import THEORY, TheoryModel, compared, derived
+from torchchain.master.derived import THEORY, TheoryModel, compared
 from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import Regression, fit_compact, solve, stepped
 from torchchain.master.misfit import model_error
 from torchchain.master.report import Calibration, Report
 from torchchain.master.sample import Sample
+from torchchain.master.theory_rings import derived
 from torchchain.master.uncertainty import Uncertainty, block_draws, combined, horizon, of_parts
 from torchchain.master.waves import Waves
 from torchchain.threads import single_blas_thread

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -40,10 +39,11 @@ from torchchain.master.model import Embedding, TransferModel
 from torchchain.master.proof import Certificate
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.sample import Sample
+from torchchain.master.theory_rings import Ring, derived
 from torchchain.master.uncertainty import later_times
 from torchchain.theory.ladder import Waves
 from torchchain.theory.law import Law
-from torchchain.theory.transfer import TheoryTransfer, described, transfer_of_law
+from torchchain.theory.transfer import described
 from torchchain.threads import single_blas_thread
 
 LADDER = ((1, 1, 2), (2, 2, 4), (3, 3, 6), (4, 4, 8))
@@ -52,72 +52,9 @@ NEAREST = 1.0
 """Distance from fresh chains over that of two ensembles, up to which it will do: as near as another ensemble would be."""
 SHORTEST, FEWEST_BANDS = 64, 8
 """Particles and bands from which on selection tries the theory."""
-SOFT = 1e-3
-"""Energies of a band below this share of its mean are taken up smoothly, so that none is negative: an ensemble's mean of
-definition "site" may be, by some 1e-4."""
-MOST_KEPT = 8
-"""Transfers of the theory that are kept: models of one ensemble are asked for the same times again and again."""
 RATE_TIMES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
 FIRST_ROOM = 0.02
 """Distances in wavenumber are counted in units of the width of a line, or of this."""
-
-_kept: dict[tuple[Ring, tuple[float, ...]], TheoryTransfer] = {}
-
-
-@dataclass(frozen=True)
-class Ring:
-    """What the theory wants to know of chains, in numbers that can be compared.
-
-    Attributes:
-        values, weights: of the law, see :class:`torchchain.theory.Law`.
-        n_particles, n_bands, tones: of the ring and its sources.
-        dual: whether the law is that of the compliances, with equal masses.
-        damping: of the contacts.
-    """
-
-    values: tuple[float, ...]
-    weights: tuple[float, ...]
-    n_particles: int
-    n_bands: int
-    tones: tuple[int, ...]
-    dual: bool
-    damping: float
-
-
-def _derived(ring: Ring, times: Tensor) -> TheoryTransfer:
-    """The theory's transfer at these times, increasing, or at more of them that were asked for before."""
-    for known, found in list(_kept.items()):
-        if known[0] == ring and bool(torch.isin(times, found.times).all()):
-            return found
-    while len(_kept) >= MOST_KEPT:
-        _kept.pop(next(iter(_kept)), None)
-    law = Law(torch.tensor(ring.values, dtype=torch.float64), torch.tensor(ring.weights, dtype=torch.float64))
-    waves = Waves.of_tones(ring.n_particles, ring.n_bands, ring.tones, ring.dual, ring.damping)
-    found = _kept[ring, tuple(times.tolist())] = transfer_of_law(law, waves, times)
-    return found
-
-
-def derived(ring: Ring, times: Tensor) -> Tensor:
-    """T0 [source, time, receiver], nowhere negative; times may be infinite."""
-    times = times.detach().cpu().double()
-    asked = torch.cat([times[times.isfinite()], times.new_zeros(1)]).unique()
-    found = _derived(ring, asked)
-    mean = found.mean[:, torch.searchsorted(found.times, times.clamp(max=float(asked[-1])))].clone()
-    mean[:, times.isinf()] = found.long_time[:, None]
-    return _positive(mean, ring, times)
-
-
-def _positive(mean: Tensor, ring: Ring, times: Tensor) -> Tensor:
-    rows, own = torch.arange(len(mean)), torch.tensor(ring.tones) - 1
-    own = own // (ring.n_particles // 2 // ring.n_bands)
-    total = mean.sum(-1, keepdim=True)
-    moved = (total[..., 0] - mean[rows, :, own]).clamp(min=0)
-    softened = (mean + (mean.square() + (SOFT / ring.n_bands * moved[..., None]).square()).sqrt()) / 2
-    softened = softened * total / softened.sum(-1, keepdim=True).clamp(min=1e-300)
-    start = torch.zeros_like(mean[:, 0])
-    start[rows, own] = 1.0
-    softened[:, times == 0] = start[:, None]
-    return softened
 
 
 class TheoryModel(TransferModel):
@@ -332,11 +269,21 @@ def check_corrected(scene: Scene | None) -> None:
 def _derive(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
     check_scene(sample.scene)
     assert sample.scene is not None, "checked"
-    model = TheoryModel.of(sample.scene)
-    end = sample.times[-1:]
-    if end > 0 and not sample.damped:  # all that a calibration asks for, at once
-        derived(model.ring, torch.cat([sample.times, end * end.new_tensor(BEYOND), later_times(float(end))]))
-    return model, None
+    return _derived_for(sample.scene, sample.times, sample.damped), None
+
+
+def _derived_for(scene: Scene, times: Tensor, damped: bool) -> TheoryModel:
+    """The model of a scene, with all that a calibration asks of it at hand."""
+    model, end = TheoryModel.of(scene), times[-1:]
+    if end > 0 and not damped:
+        derived(model.ring, torch.cat([times, end * end.new_tensor(BEYOND), later_times(float(end))]))
+    return model
+
+
+def foresee(scene: Scene) -> None:
+    """Compute what the selection of a model for a scene will ask of the theory, where it will: before there are any chains."""
+    if THEORY.describes(scene) and THEORY.tried_on(scene) and scene.distinct_realizations // scene.sample_size >= 4:
+        _derived_for(scene, scene.times, scene.largest_damping > 0)
 
 
 def _regression(sample: Sample, degrees: tuple[int, int, int]) -> tuple[Regression, TheoryModel]:
