@@ -197,6 +197,7 @@ def test_a_few_chains_are_not_followed_with_thousands_of_numbers(n_particles, ch
     off, own = (tc.total_variation(found, many.mean)[:, 1:].mean() for found in (master.transfer(few.times), few.mean))
     assert float(off) < 0.9 * float(own)  # nearer to the ensemble than these chains are
     assert certify(master.model).holds
+    assert realizations > 1 or master.horizon == TIMES[-1]  # one chain has no noise to be settled within
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

@@ -305,6 +305,8 @@ def horizon(transfer: BandTransfer, model: TransferModel) -> float:
         return end
     late = transfer.times > 0.75 * end
     noise = 2 * float(statistical_distance(transfer.stderr[:, late]).mean())
+    if not math.isfinite(noise):  # of one chain nothing tells whether it has settled
+        return end
     settled = float(total_variation(transfer.mean[:, late], transfer.long_time[:, None]).mean())
     try:
         foreseen = model.transfer(later_times(end).to(transfer.times)).detach()
