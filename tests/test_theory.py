@@ -223,6 +223,15 @@ def test_mean_wave_is_that_of_all_rings_of_two_masses(xi):
     assert bool((error[:, 1:3] < 0.1 * ((medium - counted).abs() / counted.abs())[:, 1:3]).all())
 
 
+@pytest.mark.parametrize(("xi", "top", "most"), [(0.3, 2.8, 2e-3), (0.5, 3.3, 2e-3), (0.7, 4.2, 0.01)])
+def test_mean_wave_has_converged_close_above_the_axis(xi, top, most):
+    """Also where the spectrum of clusters ends, at 2 / sqrt(1 - xi), which the medium knows nothing of."""
+    w = torch.cat([torch.linspace(0.05, top, 40, dtype=torch.float64), 2 / math.sqrt(1 - xi) + torch.tensor([-0.02, 0.0, 0.02])])
+    z, k = torch.complex(w, torch.full_like(w, 0.1)), torch.tensor([0.8, 2.2, 3.0], dtype=torch.float64)
+    few, many = (mean_resolvent(z, law_of(tc.Disorder("binary", xi)), k, orders)[0] for orders in (32, 64))
+    assert float(((few - many).abs() / many.abs()).max()) < most
+
+
 def test_clusters_of_light_particles_beat():
     times = torch.tensor([16.0, 40.0, 100.0, 200.0], dtype=torch.float64)
     disorder = tc.Disorder("binary", 0.5)

@@ -7,10 +7,11 @@ one side of a particle obeys rho_n = 1 / (2 - z^2 m_n - rho_(n+1)), and
 
     G_00 = 1 / (2 - z^2 m_0 - rho_left - rho_right),    G_0x = G_00 rho_1 ... rho_x.
 
-Each step maps the upper half-plane into itself, so with s = (rho - p) / (rho - p*), p the medium's own ratio, means of
-analytic functions of rho follow from the moments < s^n >, and one step is a matrix on their Taylor coefficients: (Cf)(s) = < f(s') >.
-The moments are its fixed point, and sums over x with exp(ikx) are resolvents of D, (Df)(s) = < rho' f(s') >. Where every particle is far above
-its resonance, the unit disk of rho itself takes the place of the half-plane. The orders that are kept converge as fast as Im z allows.
+Each step maps the upper half-plane into the disk Im 1 / rho < -Im z^2 m of the lightest particle, and that well into itself. So with
+s = (1 / rho - 1 / p) / (1 / rho - 1 / p'), p a ratio in the disk and p' its reflection at the edge, means of analytic functions of
+rho follow from the moments < s^n >, and one step is a matrix on their Taylor coefficients: (Cf)(s) = < f(s') >. The moments are its fixed
+point, and sums over x with exp(ikx) are resolvents of D, (Df)(s) = < rho' f(s') >. Where every particle is far from its resonance,
+or above it, the unit disk of rho takes the place of that disk. The orders that are kept converge as fast as Im z allows.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _BEYOND = 0.4  # above the edge of the spectrum by this, the medium is exact eno
 _ORDERS, _EARLY_ORDERS = 32, 36
 _OVERSAMPLED, _RADIUS = 3, 0.9  # nodes an order, on a circle of this radius, for Taylor coefficients
 _BLOCK = 100  # frequencies at a time
-_FAR = 2.3  # from here on |2 - z^2 m| is far from resonance
+_FAR, _ABOVE = 2.3, -2.05  # from |2 - z^2 m| or to 2 - z^2 m on, particles are far from or above resonance
 
 
 def mean_resolvent(z: Tensor, law: Law, wavenumbers: Tensor, orders: int = _ORDERS) -> tuple[Tensor, Tensor]:
@@ -66,19 +67,19 @@ def mean_resolvent(z: Tensor, law: Law, wavenumbers: Tensor, orders: int = _ORDE
     """
     mass, _ = coherent_mass(z, law)
     argument = z.square() * mass
-    point = 2 / (2 - argument + 1 / site_resolvent(argument))
     inverse = 2 - z.square()[:, None] * law.values  # (frequency, value)
-    far = inverse.abs().amin(-1) > _FAR
+    far = (inverse.abs().amin(-1) > _FAR) | (inverse.real.amax(-1) < _ABOVE)
+    inner, outer = _disk(inverse, (2 - argument + 1 / site_resolvent(argument)) / 2)
     weights = law.weights.to(z)
     nodes = _OVERSAMPLED * orders
     order, node = torch.arange(orders), torch.arange(nodes)
     circle = _RADIUS * torch.exp(2j * math.pi * node.double() / nodes)
     taylor = torch.exp(-2j * math.pi * (order[:, None] * node).double() / nodes) / nodes
     taylor = (taylor * _RADIUS ** -order.double()[:, None]).T  # values at the nodes times this are coefficients
-    at = torch.where(far[:, None], circle, (point[:, None] - point.conj()[:, None] * circle) / (1 - circle))
-    ratio = 1 / (inverse[..., None] - at[:, None])  # (frequency, value, node)
-    some, other = point[:, None, None], point.conj()[:, None, None]
-    step = torch.where(far[:, None, None], ratio, (ratio - some) / (ratio - other))
+    at = torch.where(far[:, None], circle, (1 - circle) / (inner[:, None] - outer[:, None] * circle))
+    onto = inverse[..., None] - at[:, None]  # (frequency, value, node)
+    ratio = 1 / onto
+    step = torch.where(far[:, None, None], ratio, (onto - inner[:, None, None]) / (onto - outer[:, None, None]))
     once, onward = torch.empty(2, len(z), orders, nodes, dtype=z.dtype)
     power = weights[:, None].expand_as(step)
     for n in range(orders):
@@ -101,6 +102,25 @@ def mean_resolvent(z: Tensor, law: Law, wavenumbers: Tensor, orders: int = _ORDE
     swept = (parts * (1 / (turn - values) + 1 / (1 / turn - values))).sum(-1)
     exact = (moments * local).sum(-1) + swept
     return exact, 1 / (4 * torch.sin(wavenumbers / 2).square()[:, None] - argument)
+
+
+def _disk(inverse: Tensor, medium: Tensor) -> tuple[Tensor, Tensor]:
+    """1 / rho at the center of the disk in which every ratio lies, and at its reflection, (frequency,).
+
+    Im 1 / rho is below the smallest loss of a particle, c: that is a disk, which each step maps well into itself. Its center is
+    the medium's ratio, and that of a chain of the lightest particles alone where all others are above their resonance.
+
+    Args:
+        inverse: 2 - z^2 m, (frequency, value).
+        medium: 1 / rho of the medium, (frequency,).
+    """
+    order = inverse.real.argsort(-1, descending=True)
+    light = inverse.gather(-1, order[:, :1])[:, 0]
+    root = (light.square() - 4).sqrt()
+    alone = (light + torch.where((light + root).abs() > (light - root).abs(), root, -root)) / 2
+    above = (inverse.gather(-1, order[:, 1:]).real < -2).all(-1)
+    center = torch.where(above, alone, medium)
+    return center, center.conj() - 2j * (-inverse.imag).amin(-1)
 
 
 def mean_wave_energy(law: Law, waves: Waves, times: Tensor) -> tuple[Tensor, Tensor]:
