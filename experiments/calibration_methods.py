@@ -39,10 +39,11 @@ SMOKE = Config(n_particles=32, n_bands=4, realizations=4, stop=5.0, adam_steps=2
 
 
 def candidates(config: Config) -> list[tuple[str, str, str, dict[str, Any]]]:
-    """Label, method, model and settings of everything that the library can fit."""
+    """Label, method, model and settings of everything that the library can fit to such chains."""
     found: list[tuple[str, str, str, dict[str, Any]]] = []
+    scene = config.scene(config.strength)
     for method in methods():
-        models = [record.name for record in fitted_by(method)]
+        models = [record.name for record in fitted_by(method) if record.describes(scene)]
         if method == "adam":
             found += [(f"adam, {c}", method, model, {"constraint": c, "steps": config.adam_steps})
                       for model in models for c in CONSTRAINTS]  # fmt: skip

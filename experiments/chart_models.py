@@ -56,7 +56,7 @@ SMOKE = Config(n_particles=32, realizations=4, stop=5.0, bands=(4,), largest_sea
 
 def candidates(config: Config, n_bands: int) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
     """What :mod:`calibration_methods` compares, without error bars, and the searches only where they take seconds."""
-    for label, method, model, settings in calibration_methods.candidates(config):  # type: ignore[arg-type]
+    for label, method, model, settings in calibration_methods.candidates(replace(config, n_bands=n_bands)):  # type: ignore[arg-type]
         if method not in SEARCHES or (n_bands <= config.largest_search and model in SEARCHED):
             yield label, method, model, settings | {"bootstrap": 0}
 

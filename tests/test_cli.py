@@ -342,11 +342,11 @@ def test_nan_devices_and_empty_words(run):
 CALIBRATE_FLAGS = [
     (
         "--fit magic",
-        "method must be one of analytic, linear, nonlinear, adam, projection, derivation, correction, logistic, got 'magic'",
+        "method must be one of analytic, linear, nonlinear, adam, projection, derivation, correction, ringing, logistic, got 'magic'",
     ),
     (
         "--model magic",
-        "model must be one of paper, exact_psi, basis_matrix, swing_in, memory, theory, corrected_theory, compact, got 'magic'",
+        "model must be one of paper, exact_psi, basis_matrix, swing_in, memory, theory, corrected_theory, ringing_theory, compact, got 'magic'",
     ),
     (
         "--fit linear --model memory",

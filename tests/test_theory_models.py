@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -10,12 +11,17 @@ import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.master import TheoryModel, theory_rings
 from torchchain.master.compact import n_coefficients
-from torchchain.master.derived import foresee
+from torchchain.master.derived import _regression, foresee
+from torchchain.master.logistic import stepped
+from torchchain.master.ringing import DECAY, Ringing, size_of
+from torchchain.master.sample import Sample
 from torchchain.master.selection import rungs
 
 F64 = torch.float64
 TIMES = torch.cat([torch.arange(0.0, 2.0, 0.25), torch.arange(2.0, 60.0, 4.0)]).double()
 SCENE = tc.Scene(n_particles=64, n_bands=8, disorder=tc.Disorder(strength=0.3), times=TIMES, realizations=40, seed=4)
+BINARY = replace(SCENE, disorder=tc.Disorder("binary", 0.5))
+RINGS = (2, 2, 4, 1, 3)
 LATE = torch.tensor([0.0, 0.1, 1.0, 13.0, 700.0, 1e4, 1e7, torch.inf], dtype=F64)
 
 
@@ -40,6 +46,18 @@ def corrected(scale):
     return TheoryModel.of(SCENE, (2, 2, 4), scale * noise)
 
 
+@pytest.fixture(scope="module")
+def binary():
+    return tc.band_transfer(BINARY, method="modes", starts=False)
+
+
+def ringing(scale, smooth=None):
+    """With coefficients of the polynomials, too, as large as ``smooth``."""
+    noise = torch.randn(size_of(RINGS), generator=torch.Generator().manual_seed(2), dtype=F64)
+    noise[: n_coefficients(RINGS[:3])] *= (scale if smooth is None else smooth) / max(scale, 1e-300)
+    return TheoryModel.of(BINARY, RINGS, scale * noise)
+
+
 def test_without_a_fitted_number_it_is_the_theory(transfer):
     master = tc.calibrate(transfer, model="theory")
     theory = tc.band_transfer(SCENE, method="theory")
@@ -61,6 +79,59 @@ def test_any_coefficients_give_a_transfer_that_conserves_energy_and_is_never_neg
     assert float(found.min()) >= 0
     torch.testing.assert_close(found.sum(-1), torch.ones(8, len(LATE), dtype=F64), rtol=0, atol=1e-13)
     torch.testing.assert_close(found[:, 0], torch.eye(8, dtype=F64), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3, 30.0])
+def test_any_ringing_conserves_energy_is_never_negative_and_dies_out(scale):
+    found = ringing(scale).transfer(LATE)
+    assert float(found.min()) >= 0
+    torch.testing.assert_close(found.sum(-1), torch.ones(8, len(LATE), dtype=F64), rtol=0, atol=1e-13)
+    torch.testing.assert_close(found[:, 0], torch.eye(8, dtype=F64), rtol=0, atol=1e-15)
+    silent = ringing(scale)
+    silent.coefficients[n_coefficients(RINGS[:3]) :] = 0
+    assert torch.equal(found[:, -1], silent.transfer(LATE)[:, -1])
+    assert (float((found - silent.transfer(LATE))[:, 2:4].abs().max()) > 1e-3) is (scale > 0)
+
+
+def test_ringing_is_what_the_formula_says():
+    model = ringing(0.3)
+    rings = Ringing.of(model.ring, 1, 3)
+    t, s, r = 7.0, 5, 2
+    coefficients = model.coefficients[-size_of(RINGS) + n_coefficients(RINGS[:3]) :].reshape(
+        2, 3, 3
+    )  # cosine or sine, W, product
+    place = [[1.0, 2 * x / 7 - 1] for x in (s, r)]
+    low, high = 1.2 / np.sqrt(1.5), 2 / np.sqrt(0.5)
+    expected = 0.0
+    for here, there, tone in ((*place, BINARY.tones[s]), (*place[::-1], BINARY.tones[r])):
+        shapes = np.array([here[i] * there[j] for i, j in ((0, 0), (0, 1), (1, 0))])
+        for number, cluster in enumerate((low, (low + high) / 2, high)):
+            phase = (cluster - 2 * np.sin(np.pi * tone / 64)) * t
+            parts = np.cos(phase) * coefficients[0, number].numpy() + np.sin(phase) * coefficients[1, number].numpy()
+            expected += float(parts @ shapes)
+    expected *= np.exp(-DECAY * t) * (1 - np.exp(-(t**2) / 4))
+    found = rings.exponent(torch.tensor([t], dtype=F64), coefficients.flatten())
+    assert float(found[s, 0, r]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_pull_is_the_slope_of_the_misfit(binary):
+    problem, _ = _regression(Sample.of(binary), RINGS)
+    rng = np.random.default_rng(0)
+    at, along = rng.normal(size=(2, problem.size)) * 0.1
+    _, pull = problem.normal(problem.predicted(at), at)
+    step = 1e-5
+    down, up = (problem.misfit(at + x * along)[0] for x in (-step, step))
+    assert (up - down) / (2 * step) == pytest.approx(-2 * pull @ along, rel=1e-5)
+
+
+def test_one_step_follows_data_that_are_drawn_again(binary):
+    problem, _ = _regression(Sample.of(binary), RINGS)
+    rng = np.random.default_rng(0)
+    found, changed = rng.normal(size=(2, problem.size)) * [[0.1], [0.003]]
+    own = replace(problem, data=problem.predicted(found))
+    other = replace(problem, data=problem.predicted(found + changed))
+    moved = stepped([own], np.ones((1, 1)), found[None], [other.data[None]])[0, 0]
+    assert other.misfit(moved)[0] < 0.02 * other.misfit(found)[0]
 
 
 @pytest.mark.parametrize("settings", [{}, {"model": "corrected_theory", "degrees": (1, 1, 2)}])
@@ -96,6 +167,48 @@ def test_correction_recovers_what_was_changed():
     bare = distance(TheoryModel.of(SCENE).transfer(TIMES), exact)
     assert bare > 0.02
     assert distance(master.transfer(TIMES), exact) < 0.15 * bare
+
+
+def test_ringing_is_recovered():
+    exact = ringing(0.3, 0.02).transfer(TIMES)
+    late = ringing(0.3, 0.02).transfer(LATE[-1:])[:, 0]
+    data = replace(tc.band_transfer(BINARY, method="theory"), mean=exact, long_time=late)
+    rings, plain = (tc.calibrate(data, model=model, degrees=degrees, bootstrap=0).transfer(TIMES)
+                    for model, degrees in (("ringing_theory", RINGS), ("corrected_theory", RINGS[:3])))  # fmt: skip
+    assert distance(plain, exact) > 0.003
+    assert distance(rings, exact) < 0.1 * distance(plain, exact)
+
+
+def test_clusters_of_light_particles_ring_in_fresh_chains(binary):
+    """As many numbers, most of them for the beats, come nearer than those for polynomials alone."""
+    fresh = tc.band_transfer(replace(BINARY, seed=5, realizations=400), method="modes", starts=False)
+    rings, plain = (tc.calibrate(fresh, bootstrap=0, model=model, degrees=degrees) for model, degrees in (
+        ("ringing_theory", (4, 4, 8, 2, 8)), ("corrected_theory", (7, 5, 12))))  # fmt: skip
+    assert rings.n_parameters <= plain.n_parameters
+    other = tc.band_transfer(replace(BINARY, seed=6, realizations=400), method="modes", starts=False)
+    assert distance(rings.transfer(TIMES), other.mean) < 0.93 * distance(plain.transfer(TIMES), other.mean)
+
+
+def test_ringing_is_kept_in_a_file_with_its_error_bars(binary, tmp_path):
+    master = tc.calibrate(binary, model="ringing_theory", degrees=RINGS)
+    master.save(tmp_path / "q.safetensors")
+    again = tc.MasterEquation.load(tmp_path / "q.safetensors")
+    assert torch.equal(again.transfer(LATE[:-1]), master.transfer(LATE[:-1]))
+    assert again.n_parameters == size_of(RINGS) == 23 + 18
+    assert again.calibration.report.certificate.holds
+    own = torch.eye(8, dtype=bool)[:, None].expand(-1, len(TIMES), -1)
+    error = again.standard_error(torch.eye(8, dtype=F64), TIMES)
+    assert float(error[own][TIMES.repeat(8) > 1].min()) > 0
+
+
+def test_chains_without_clusters_alike_do_not_ring(transfer, binary):
+    with pytest.raises(FieldError, match="disorder.kind must be 'binary' for model 'ringing_theory'"):
+        tc.calibrate(transfer, model="ringing_theory", degrees=RINGS)
+    with pytest.raises(FieldError, match="degrees must be five integers"):
+        tc.calibrate(binary, model="ringing_theory", degrees=(2, 2, 4))
+    for data, tried in ((transfer, False), (binary, True)):
+        found = [recipe.model.name for recipe in rungs(tc.Recipe(None, None, (0.5, 2.0)), data)]
+        assert ("ringing_theory" in found) is tried
 
 
 def test_damped_chains_lose_the_energy_that_the_theory_says():

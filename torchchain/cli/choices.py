@@ -21,8 +21,10 @@ SOLVERS = (
     "expm", "dopri8", "dopri5", "bosh3", "fehlberg2", "adaptive_heun", "euler", "midpoint", "heun2", "heun3", "rk4",
     "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver",
 )  # fmt: skip
-FITS = ("analytic", "linear", "nonlinear", "adam", "derivation", "correction", "logistic", "projection")
-MODELS = ("paper", "exact_psi", "basis_matrix", "swing_in", "theory", "corrected_theory", "compact", "memory")
+FITS = ("analytic", "linear", "nonlinear", "adam", "derivation", "correction", "ringing", "logistic", "projection")
+MODELS = (
+    "paper", "exact_psi", "basis_matrix", "swing_in", "theory", "corrected_theory", "ringing_theory", "compact", "memory",
+)  # fmt: skip
 FORMATS = ("lammps", "mercury", "xyz", "netcdf")
 UNITS = ("file", "mass", "linear", "hertz")
 FIGURES = ("png", "pdf", "svg")

@@ -6,6 +6,7 @@ multiply:
 
     T[s, r](t) = o_sr / sum_r' o_sr',   o_sr = T0[s, r](t) exp(p(u, v, tau)),   o_ss = T0[s, s](t) exp(q(u, tau)).
 
+For masses of few values they may be multiplied by what clusters of light ones ring, too (:mod:`torchchain.master.ringing`).
 For any coefficients nothing is negative, rows add up to 1, T(0) = I, and without coefficients T = T0.
 """
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,15 +24,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master.compact import (
-    checked_degrees,
-    clock_of,
-    n_coefficients,
-    nearest_memory,
-    polynomials,
-    power,
-    terms,
-)
+from torchchain.master.compact import clock_of, nearest_memory, polynomials, power, terms
 from torchchain.master.compact_record import CompactReport, CompactSettings, drawn_again
 from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import BEYOND, Regression, fit_points, solve, stepped
@@ -38,23 +32,25 @@ from torchchain.master.memory import MemoryModel
 from torchchain.master.model import Embedding, TransferModel
 from torchchain.master.proof import Certificate
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
+from torchchain.master.ringing import Degrees, Ringing, RingingRegression, checked, size_of
 from torchchain.master.sample import Sample
-from torchchain.master.theory_rings import Ring, derived
+from torchchain.master.theory_rings import Ring, derived, shapes
 from torchchain.master.uncertainty import later_times
 from torchchain.theory.ladder import Waves
 from torchchain.theory.law import Law
+from torchchain.theory.mean_wave import MOST_VALUES
 from torchchain.theory.transfer import described
 from torchchain.threads import single_blas_thread
 
 LADDER = ((1, 1, 2), (2, 2, 4), (3, 3, 6), (4, 4, 8))
 """Degrees in place, distance and time that are tried one after the other."""
+RINGING_LADDER = ((8, 4, 16, 4, 8), (8, 4, 16, 5, 12))
+"""The same of corrections that ring, with the ringing's degree and its frequencies: 486 and 750 numbers."""
 NEAREST = 1.0
 """Distance from fresh chains over that of two ensembles, up to which it will do: as near as another ensemble would be."""
 SHORTEST, FEWEST_BANDS = 64, 8
 """Particles and bands from which on selection tries the theory."""
 RATE_TIMES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
-FIRST_ROOM = 0.02
-"""Distances in wavenumber are counted in units of the width of a line, or of this."""
 
 
 class TheoryModel(TransferModel):
@@ -66,8 +62,9 @@ class TheoryModel(TransferModel):
         tones: the sources, one in each band, (band,).
         dual: 1 for random stiffnesses of equal masses, else 0.
         contact_damping: of the contacts.
-        degrees: of the polynomials in place, distance and time, (3,); (0,) for none.
-        coefficients: of :func:`torchchain.master.compact.terms`, (term,).
+        degrees: of the polynomials in place, distance and time, (3,); (0,) for none; of one that rings also of the ringing's
+            polynomials and of how many frequencies, (5,).
+        coefficients: of :func:`torchchain.master.compact.terms`, then of the ringing by beat and product, (term,).
 
     Example:
         >>> model = tc.master.TheoryModel.of(tc.Scene(n_particles=64, n_bands=8, disorder=tc.Disorder(strength=0.2)))
@@ -102,8 +99,8 @@ class TheoryModel(TransferModel):
         if not bands or n % (2 * bands) or [(tone - 1) // (n // 2 // bands) for tone in numbers] != list(range(bands)):
             raise checks.fail("tones", "lie one in each band, in order", numbers)
         loss = checks.number("contact_damping", float(contact_damping), at_least=0)
-        self.degrees_ = None if len(degrees) == 1 else checked_degrees([int(degree) for degree in degrees])
-        size = 0 if self.degrees_ is None else n_coefficients(self.degrees_)
+        self.degrees_ = None if len(degrees) == 1 else checked([int(degree) for degree in degrees])
+        size = 0 if self.degrees_ is None else size_of(self.degrees_)
         coefficients = checks.real_tensor("coefficients", coefficients)
         if tuple(coefficients.shape) != (size,):
             raise checks.fail("coefficients", f"have shape {(size,)}", f"shape {tuple(coefficients.shape)}")
@@ -115,9 +112,7 @@ class TheoryModel(TransferModel):
         self.coefficients: Tensor
 
     @classmethod
-    def of(
-        cls, scene: Scene, degrees: tuple[int, int, int] | None = None, coefficients: Tensor | None = None
-    ) -> TheoryModel:
+    def of(cls, scene: Scene, degrees: Degrees | None = None, coefficients: Tensor | None = None) -> TheoryModel:
         """The model of a scene's chains."""
         check_scene(scene)
         law, _ = covered(scene)
@@ -184,14 +179,23 @@ class TheoryModel(TransferModel):
         found = derived(self.ring, times).to(self.coefficients)
         if self.degrees_ is None:
             return found
-        first, own = _shapes(self.ring, self.degrees_)
-        clock = polynomials(clock_of(times), self.degrees_[2])
-        p, q = terms(self.degrees_)
-        eye = torch.eye(self.n_bands).to(found)[:, None]
-        stays = power(own.to(found), clock, self.coefficients[len(p) :], q)
-        factor = power(first.to(found), clock, self.coefficients[: len(p)], p) * (1 - eye) + stays * eye
-        moved = found * factor
+        moved = found * self._factor(times, found)
         return moved * (found.sum(-1, keepdim=True) / moved.sum(-1, keepdim=True))
+
+    def _factor(self, times: Tensor, like: Tensor) -> Tensor:
+        """Of each pair's odds, positive, [source, time, receiver]."""
+        assert self.degrees_ is not None, "there are coefficients"
+        degrees = self.degrees_[:3]
+        first, own = shapes(self.ring, degrees)
+        clock = polynomials(clock_of(times), degrees[2])
+        p, q = terms(degrees)
+        smooth, rings = self.coefficients[: len(p) + len(q)], self.coefficients[len(p) + len(q) :]
+        eye = torch.eye(self.n_bands).to(like)[:, None]
+        stays = power(own.to(like), clock, smooth[len(p) :], q)
+        factor = power(first.to(like), clock, smooth[: len(p)], p) * (1 - eye) + stays * eye
+        if len(rings):
+            factor = factor * Ringing.of(self.ring, *self.degrees_[3:]).exponent(times, rings).exp()
+        return factor
 
     def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
         return torch.einsum("...s,str->...tr", initial, self._at(times))
@@ -208,26 +212,6 @@ class TheoryModel(TransferModel):
 def _whole(name: str, value: Tensor, least: int, most: int | None = None) -> int:
     number = float(value)
     return checks.integer(name, int(number) if number.is_integer() else number, least, most)
-
-
-def _shapes(ring: Ring, degrees: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    """Polynomials of place and distance for each pair, [source, receiver, term], and of place, [source, 1, term].
-
-    Distances are those of the wavenumbers over the widths of the lines in Born's approximation, xi^2 tan^2(k/2).
-    """
-    n, size = ring.n_bands, ring.n_particles
-    values, weights = (torch.tensor(x, dtype=torch.float64) for x in (ring.values, ring.weights))
-    mean = float((weights * values).sum())
-    spread = float((weights * (values - mean).square()).sum())
-    k = 2 * math.pi / size * torch.tensor(ring.tones, dtype=torch.float64)
-    width = spread * torch.tan(k.clamp(max=0.9 * math.pi) / 2).square() + FIRST_ROOM
-    far = torch.asinh((k[:, None] - k).abs() / (width[:, None] + width))
-    far = far / far.max().clamp(min=1e-9)
-    band = torch.arange(n, dtype=torch.float64) / max(n - 1, 1)
-    place, distance = polynomials((band[:, None] + band) / 2, degrees[0]), polynomials(far, degrees[1])
-    p, _ = terms(degrees)
-    pairs = list(dict.fromkeys((i, j) for i, j, _ in p))
-    return torch.stack([place[..., i] * distance[..., j] for i, j in pairs], -1), polynomials(band, degrees[0])[:, None]
 
 
 def compared(scene: Scene | None) -> bool:
@@ -266,6 +250,51 @@ def check_corrected(scene: Scene | None) -> None:
         raise checks.fail("n_bands", "be at least 2 for model 'corrected_theory'", scene.n_bands)
 
 
+def check_ringing(scene: Scene | None) -> None:
+    """Raise for chains in which no clusters ring alike: those of masses, or compliances, of many values."""
+    check_corrected(scene)
+    assert scene is not None, "checked"
+    law, _ = covered(scene)
+    if not 1 < len(law.values) <= MOST_VALUES:
+        raise checks.fail("disorder.kind", "be 'binary' for model 'ringing_theory'", repr(scene.disorder.kind))
+
+
+@dataclass(frozen=True)
+class RingingSettings:
+    """Settings of the regression.
+
+    Attributes:
+        degrees: in place, distance and time, of the ringing in both places, and its frequencies; None for the smallest that
+            reach the ensemble's own error.
+    """
+
+    degrees: Degrees | None = None
+
+    def __post_init__(self) -> None:
+        if self.degrees is None:
+            return
+        object.__setattr__(self, "degrees", checked(self.degrees))
+        if len(self.degrees) != 5:
+            raise checks.fail("degrees", "be five integers for model 'ringing_theory'", self.degrees)
+
+
+@dataclass(frozen=True)
+class RingingReport:
+    """How the regression went.
+
+    Attributes:
+        converged: whether it ended by itself.
+        steps: that it took.
+        misfit: root mean square, in units of the error.
+        degrees: see :class:`RingingSettings`.
+    """
+
+    converged: bool
+    steps: int
+    misfit: float
+    degrees: tuple[int, ...]
+
+
 def _derive(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
     check_scene(sample.scene)
     assert sample.scene is not None, "checked"
@@ -286,23 +315,29 @@ def foresee(scene: Scene) -> None:
         _derived_for(scene, scene.times, scene.largest_damping > 0)
 
 
-def _regression(sample: Sample, degrees: tuple[int, int, int]) -> tuple[Regression, TheoryModel]:
+def _regression(sample: Sample, degrees: Degrees) -> tuple[Regression, TheoryModel]:
     assert sample.scene is not None, "checked"
-    start = TheoryModel.of(sample.scene, degrees, torch.zeros(n_coefficients(degrees), dtype=torch.float64))
+    start = TheoryModel.of(sample.scene, degrees, torch.zeros(size_of(degrees), dtype=torch.float64))
     times, data, weight = fit_points(sample.times, sample.mean, sample.long_time, sample.distance)
-    odds = derived(start.ring, times)
-    return Regression.of_odds(odds, _shapes(start.ring, degrees), degrees, times, data, weight), start
+    smooth = degrees[:3]
+    found = Regression.of_odds(derived(start.ring, times), shapes(start.ring, smooth), smooth, times, data, weight)
+    if len(degrees) == 5:
+        found = RingingRegression.added(found, Ringing.of(start.ring, *degrees[3:]), times)
+    return found, start
 
 
 def _correct(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
     check_corrected(sample.scene)
     degrees = recipe.settings.degrees
+    if len(degrees) == 5:
+        check_ringing(sample.scene)
     problem, model = _regression(sample, degrees)
     first = near.coefficients if isinstance(near, TheoryModel) and near.degrees_ == degrees else model.coefficients
     with single_blas_thread():
         found, told = solve([problem], np.ones((1, 1)), first.double().cpu().numpy()[None], progress)
     tensors = model.tensors() | {"coefficients": torch.from_numpy(found[0])}
-    return TheoryModel(**tensors), CompactReport(told["converged"], told["steps"], told["misfit"], degrees)
+    report = RingingReport if len(degrees) == 5 else CompactReport
+    return TheoryModel(**tensors), report(told["converged"], told["steps"], told["misfit"], degrees)
 
 
 def _same(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: Tensor) -> Iterator[TheoryModel]:
@@ -324,6 +359,12 @@ def _rungs(n_times: int) -> list[CompactSettings]:
     return [CompactSettings(degrees) for degrees in LADDER if degrees == LADDER[0] or 2 * degrees[2] <= n_times]
 
 
+def _ringing_rungs(n_times: int) -> list[RingingSettings]:
+    """The same of those that ring."""
+    known = [RingingSettings(degrees) for degrees in RINGING_LADDER]
+    return [each for each in known if each == known[0] or 2 * each.degrees[2] <= n_times]
+
+
 THEORY = ReducedModel(
     "theory", "the theory of disorder: no fitted number, and no ensemble", TheoryModel,
     (Fit("derivation", "from the law of the masses", _derive),), lambda n_bands, damped, settings: 0,
@@ -333,7 +374,14 @@ THEORY = ReducedModel(
 CORRECTED = ReducedModel(
     "corrected_theory", "the theory times exponentials of polynomials: some tens of numbers, never negative", TheoryModel,
     (Fit("correction", "logistic regression on all times", _correct, settings=CompactSettings, report=CompactReport),),
-    lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="correction",
+    lambda n_bands, damped, settings: size_of(settings.degrees or LADDER[0]), climbed_by="correction",
     needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_corrected, tried_on=compared, windows=(1.0, 5.0, 50.0),
     near=NEAREST, never_negative=True, slow=True, replicas=_again,
+)  # fmt: skip
+RINGING = ReducedModel(
+    "ringing_theory", "the corrected theory with the beats of clusters of light particles: for binary masses, never negative", TheoryModel,
+    (Fit("ringing", "regression on all times, with beats", _correct, settings=RingingSettings, report=RingingReport),),
+    lambda n_bands, damped, settings: size_of(settings.degrees or RINGING_LADDER[0]), climbed_by="ringing",
+    needs_long_time=True, needs_strength=True, rungs=_ringing_rungs, check_scene=check_ringing, tried_on=compared, windows=(1.0, 5.0, 50.0),
+    never_negative=True, slow=True, replicas=_again,
 )  # fmt: skip

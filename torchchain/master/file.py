@@ -37,7 +37,7 @@ CONVENTIONS = {
     "swing_in": "like markov, but energy moves only after it was released from rest with the rate 1 / delay",
     "memory": "e(t) = e(0) (basis + sum_m amplitudes[m] f_m(t)) exp(-damping t); f: exponentials, then cosine and sine of pairs; rates are slopes at short times, which e(t) does not use",
     "compact": "shares of a source's energy are the odds of damped beats of two waves, times exponentials of polynomials (coefficients) of place, distance and time, over their sum; of damped chains, of what is left of the energy, a mixture (loss) of damped modes; see torchchain.master.compact",
-    "theory": "the transfer of torchchain.theory for the law of the masses (nodes and weights of its quadrature), a ring and tones, times exponentials of polynomials (coefficients) of place, distance and time, over their sum; see torchchain.master.derived",
+    "theory": "the transfer of torchchain.theory for the law of the masses (nodes and weights of its quadrature), a ring and tones, times exponentials of polynomials (coefficients) of place, distance and time, and with five degrees of beats of clusters of light particles, over their sum; see torchchain.master.derived",
     "bands": "n_bands equal bands of |k| in (0, pi]; tone n lies in band ceil(n / (n_particles / 2 / n_bands))",
     "units": "mean mass 1, linear contact stiffness 1; time: travel time of sound over one particle",
 }

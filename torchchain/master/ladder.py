@@ -9,6 +9,7 @@ basis_matrix   basis energy of every pair of bands, Pi[s, r]                   2
 swing_in       rates that act some time after the energy came                  2 B^2 + 1
 theory         the theory of disorder, without chains                          none
 corrected_...  the theory times exponentials of polynomials; never negative    9 to 80, whatever B
+ringing_...    beats of clusters on top of these, for binary masses            486 or 750, whatever B
 memory         any response, as a few decay rates shared by all pairs          B^2 (1 + functions - 1) + their rates
 compact        odds of damped beats, corrected by polynomials; never negative  53 to 806, whatever B
 =============  ==============================================================  =======================================
@@ -18,14 +19,14 @@ from __future__ import annotations
 
 from torchchain import checks
 from torchchain.master.compact_record import COMPACT
-from torchchain.master.derived import CORRECTED, THEORY
+from torchchain.master.derived import CORRECTED, RINGING, THEORY
 from torchchain.master.memory import MEMORY
 from torchchain.master.model import TransferModel
 from torchchain.master.rates import BASIS_MATRIX, EXACT_PSI, PAPER, SWING_IN
 from torchchain.master.records import Fit, ReducedModel
 
 MODELS: dict[str, ReducedModel] = {
-    record.name: record for record in (PAPER, EXACT_PSI, BASIS_MATRIX, SWING_IN, MEMORY, THEORY, CORRECTED, COMPACT)
+    record.name: record for record in (PAPER, EXACT_PSI, BASIS_MATRIX, SWING_IN, MEMORY, THEORY, CORRECTED, RINGING, COMPACT)
 }  # fmt: skip
 
 

@@ -113,6 +113,11 @@ class Regression:
         """Right-hand side of what is missed, (..., source, time, receiver), over the coefficients that are held."""
         return self.equations.pull(moved(found), found, missed * self.weight[..., None] ** 2)
 
+    @property
+    def size(self) -> int:
+        """Coefficients."""
+        return int(self.held.sum())
+
     def guided(self, guide: np.ndarray) -> Regression:
         """The regression for what is to be added to known coefficients, which are multiplied into its odds."""
         exponent = np.clip(self.shape @ (self.table(guide) @ self.clock.T), -LARGEST_EXPONENT, LARGEST_EXPONENT)
@@ -148,7 +153,7 @@ def solve(
     Returns:
         (set, coefficient), and a report: converged, steps, misfit in units of the error.
     """
-    sets, size = mixing.shape[1], int(regressions[0].held.sum())
+    sets, size = mixing.shape[1], regressions[0].size
     found = np.zeros((sets, size)) if start is None else start.copy()
     stiff = (np.zeros(sets) if stiffness is None else stiffness)[:, None]
 

@@ -176,6 +176,11 @@ class ToneRegression:
         size = len(products(degrees).heads)
         self.equations = Equations(self.shape[:, :-1, :size], self.shape[:, -1, size:], self.clock, degrees)
 
+    @property
+    def size(self) -> int:
+        """Coefficients."""
+        return int(self.held.sum())
+
     def table(self, coefficients: np.ndarray) -> np.ndarray:
         """Coefficients as a table, zeros where none is."""
         table = np.zeros(self.held.shape)
