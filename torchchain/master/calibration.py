@@ -127,7 +127,7 @@ def calibrate(
         transfer: see :func:`torchchain.band_transfer`. Of damped chains, the damping d of Eq. 51 is calibrated too.
         method: "analytic": Eq. 50 with q0 fitted to the linear procedure's rates; "linear" and "nonlinear": the
             procedures L and NL of Section 3.5 on the times in the window; "adam": Q from all times, starting from L;
-            "projection": the model "memory" from all times; "logistic": the model "compact" from all times. None for the one that fits the model best.
+            "projection": the model "memory" from all times; "logistic": the model "compact" from all times; "ringing": the theory of binary masses, corrected. None for the one that fits the model best.
         model: "paper" (basis energy Psi of Eq. 47), "exact_psi", "basis_matrix", "swing_in", "compact", "memory" (all but the
             first need the long-time average) or a registered one; None: the richest that the method fits. Where the
             transfer has no long-time average and no model is named, that of the later half of its times serves, with a warning.
@@ -137,7 +137,7 @@ def calibrate(
             that would take long ("adam", "nonlinear") and with fewer than 4 blocks of realizations.
         progress: show a bar if the output is a terminal.
         settings: for "adam" the fields of :class:`AdamSettings`; for "projection" ``order``, the numbers of exponentials
-            and of pairs, and ``certified``, for one of that order that is never negative; for "logistic" ``degrees`` in place, distance and time (none: the smallest that reaches the ensemble's own error on held-out realizations).
+            and of pairs, and ``certified``, for one of that order that is never negative; for "logistic" and "correction" ``degrees`` in place, distance and time, for "ringing" also of its polynomials and how many frequencies (none: the smallest that reach the ensemble's own error on held-out realizations).
 
     Returns:
         MasterEquation, whose ``calibration.report`` tells how the model was chosen and fitted.

@@ -155,10 +155,11 @@ class RingingRegression(Regression):
         return moved / moved.sum(-1, keepdims=True)
 
     def normal(self, found: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        matrix = RIDGE * np.eye(self.size)
-        for slope in self._slopes(found):
+        matrix, pull = RIDGE * np.eye(self.size), -RIDGE * coefficients
+        for i, slope in enumerate(self._slopes(found)):
             matrix += slope.T @ slope
-        return matrix, self.pull(found, self.data - found) - RIDGE * coefficients
+            pull += slope.T @ ((self.data[:, i] - found[:, i]) * self.weight[:, i, None]).ravel()
+        return matrix, pull
 
     def pull(self, found: np.ndarray, missed: np.ndarray) -> np.ndarray:
         result = np.zeros((*missed.shape[:-3], self.size))
