@@ -17,6 +17,7 @@ TOGETHER = {"cpu": 2**25, "cuda": 2**30}
 DECOMPOSED = {"cpu": 2**22, "cuda": 2**30}  # and of the matrices of a long-time average
 GROUPS = 16  # at least so many, for the threads to share
 CHUNK_WORK = 2**26  # particles times rows times times of a chunk of the stencil: about a second
+PARTS = 5  # chunks of a worker, for the progress bar, and that what goes on beside them may begin early
 BLOCKS = 20
 
 
@@ -56,8 +57,8 @@ class Layout:
         threads = torch.get_num_threads() if self.device.type == "cpu" else 1
         if self.fused:
             workers = max(1, min(threads, realizations))
-            half = -(-realizations // (2 * workers))  # two chunks a worker, for the progress bar
-            size = max(1, min(half, self.largest, budget // workers // self.held))
+            part = -(-realizations // (PARTS * workers))
+            size = max(1, min(part, self.largest, budget // workers // self.held))
             return Chunks(-(-size // self.group) * self.group, workers)
         fitting = budget // (self.group * self.held)
         return Chunks(self.group, max(1, min(threads, -(-realizations // self.group), fitting)))
