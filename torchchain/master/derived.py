@@ -50,6 +50,8 @@ NEAREST = 1.0
 """Distance from fresh chains over that of two ensembles, up to which it will do: as near as another ensemble would be."""
 SHORTEST, FEWEST_BANDS = 64, 8
 """Particles and bands from which on selection tries the theory."""
+MOST_RINGING_BANDS = 64
+"""Bands up to which selection tries the ringing, whose fit costs as their square: half a minute of processor time at 64."""
 RATE_TIMES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
 
 
@@ -250,6 +252,11 @@ def check_corrected(scene: Scene | None) -> None:
         raise checks.fail("n_bands", "be at least 2 for model 'corrected_theory'", scene.n_bands)
 
 
+def ringing_compared(scene: Scene | None) -> bool:
+    """The same of the ringing, as long as its fit is quick."""
+    return scene is not None and compared(scene) and scene.n_bands <= MOST_RINGING_BANDS
+
+
 def check_ringing(scene: Scene | None) -> None:
     """Raise for chains in which no clusters ring alike: those of masses, or compliances, of many values."""
     check_corrected(scene)
@@ -382,6 +389,6 @@ RINGING = ReducedModel(
     "ringing_theory", "the corrected theory with the beats of clusters of light particles: for binary masses, never negative", TheoryModel,
     (Fit("ringing", "regression on all times, with beats", _correct, settings=RingingSettings, report=RingingReport),),
     lambda n_bands, damped, settings: size_of(settings.degrees or RINGING_LADDER[0]), climbed_by="ringing",
-    needs_long_time=True, needs_strength=True, rungs=_ringing_rungs, check_scene=check_ringing, tried_on=compared, windows=(1.0, 5.0, 50.0),
+    needs_long_time=True, needs_strength=True, rungs=_ringing_rungs, check_scene=check_ringing, tried_on=ringing_compared, windows=(1.0, 5.0, 50.0),
     never_negative=True, slow=True, replicas=_again,
 )  # fmt: skip
