@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
+import xarray
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
+from torchchain.cli import outputs
 from torchchain.ensemble import block_means
 
 N, TIMES, REALIZATIONS = 16, torch.linspace(0, 51, 205, dtype=torch.float64), 23
@@ -103,3 +106,20 @@ def test_single_realizations_and_ordered_chains_have_no_noise_to_round():
     assert torch.equal(kept, same)
     assert torch.equal(stderr, endless)
     assert np.array_equal(block_means.encoded(kept, mean, endless, counts), np.zeros(kept.shape))
+
+
+def test_files_hold_large_values_over_time_time_after_time(tmp_path):
+    """They change little from one to the next: less room, and the same numbers. Few values, and pieces too large, are left alone."""
+    walk = np.random.default_rng(0).normal(size=(40, 100, 30)).cumsum(1).round(2)
+    axes = ("source", "time", "receiver")
+    data = xarray.Dataset(
+        {"large": (axes, walk), "other": (("source", "place", "receiver"), walk), "small": (axes, walk[:2, :5])}
+    )
+    outputs.dataset(data)(tmp_path / "data.nc")
+    with h5py.File(tmp_path / "data.nc") as file:
+        assert file["large"].chunks == (40, 100, 1)
+        assert file["small"].chunks != (2, 5, 1)
+        assert file["large"].id.get_storage_size() < 0.9 * file["other"].id.get_storage_size()
+    with xarray.open_dataset(tmp_path / "data.nc", engine="h5netcdf") as found:
+        for name in data:
+            np.testing.assert_array_equal(found[name], data[name])
