@@ -109,16 +109,15 @@ def test_single_realizations_and_ordered_chains_have_no_noise_to_round():
 
 
 def test_files_hold_large_values_over_time_time_after_time(tmp_path):
-    """They change little from one to the next: less room, and the same numbers. Few values, and pieces too large, are left alone."""
+    """They change little from one to the next: less room, and the same numbers. Few values are left alone."""
     walk = np.random.default_rng(0).normal(size=(40, 100, 30)).cumsum(1).round(2)
     axes = ("source", "time", "receiver")
-    data = xarray.Dataset(
-        {"large": (axes, walk), "other": (("source", "place", "receiver"), walk), "small": (axes, walk[:2, :5])}
-    )
+    data = xarray.Dataset({"large": (axes, walk), "other": (("source", "place", "receiver"), walk)})
+    data["small"] = data["large"][0]
     outputs.dataset(data)(tmp_path / "data.nc")
     with h5py.File(tmp_path / "data.nc") as file:
         assert file["large"].chunks == (40, 100, 1)
-        assert file["small"].chunks != (2, 5, 1)
+        assert file["small"].chunks != (100, 1)
         assert file["large"].id.get_storage_size() < 0.9 * file["other"].id.get_storage_size()
     with xarray.open_dataset(tmp_path / "data.nc", engine="h5netcdf") as found:
         for name in data:
