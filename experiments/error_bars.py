@@ -113,6 +113,17 @@ def distance(found: Tensor, other: Tensor, times: Tensor) -> Tensor:
     return torch.stack([off[here].mean() for here in windows(times)])
 
 
+def of_mixtures(transfer: tc.BandTransfer, starts: Tensor) -> tuple[Tensor, Tensor]:
+    """Energies of an ensemble after starts (start, band), and their standard errors, [start, time, receiver].
+
+    Energies from several bands of a chain are not independent: the errors are those of blocks of chains.
+    """
+    weight = torch.tensor(transfer.block_counts, dtype=torch.float64)[:, None, None, None] / sum(transfer.block_counts)
+    blocks = torch.einsum("ms,bstr->bmtr", starts, transfer.block_mean.double())
+    mean = torch.einsum("ms,str->mtr", starts, transfer.mean)
+    return mean, ((weight * (blocks - mean).square()).sum(0) / (len(blocks) - 1)).sqrt()
+
+
 @dataclass(frozen=True, eq=False)
 class Measured:
     """An ensemble and its model: energies and errors from every band, and of mixtures of bands."""
@@ -139,13 +150,9 @@ def measured(scene: tc.Scene, starts: Tensor, device: str) -> Measured:
         master = tc.calibrate(own)
         eye = torch.eye(own.n_bands, dtype=torch.float64)
         found, mixed = (master.solve(each, own.times).detach() for each in (eye, starts))
-    weight = torch.tensor(own.block_counts, dtype=torch.float64)[:, None, None, None] / sum(own.block_counts)
-    blocks = torch.einsum("ms,bstr->bmtr", starts, own.block_mean.double())
-    mean = torch.einsum("ms,str->mtr", starts, own.mean)
-    stderr = ((weight * (blocks - mean).square()).sum(0) / (len(blocks) - 1)).sqrt()
     return Measured(
         own.mean, own.stderr, found, master.standard_error(eye, own.times),
-        (mixed, master.standard_error(starts, own.times), mean, stderr),
+        (mixed, master.standard_error(starts, own.times), *of_mixtures(own, starts)),
     )  # fmt: skip
 
 
@@ -190,6 +197,7 @@ def draw_shares(ax: Axes, shares: xarray.DataArray, errors: xarray.DataArray, ot
     """Shares (strength, window) with the error of each, and those of another ensemble, open."""
     ax.axhspan(*WANTED, color="0.9", label="wanted")
     ax.axhline(NORMAL, color="k", lw=0.8, ls=":")
+    ax.plot([], [], "k_", ms=7, label="two ensembles")
     count = shares.sizes["strength"]
     for i, strength in enumerate(shares.strength.values):
         place = np.arange(len(WINDOWS)) + 0.1 * (i - (count - 1) / 2)

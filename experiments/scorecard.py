@@ -9,6 +9,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
+import error_bars
 import harness
 import numpy as np
 import torch
@@ -186,7 +187,7 @@ def _score(
     if master.uncertainty is not None:
         error = master.standard_error(eye, times).square() + fresh.stderr.square()
         covered = float(((predicted - fresh.mean).square() < error)[:, later].double().mean())
-        error = master.standard_error(start, times).square() + torch.einsum("ms,str->mtr", start**2, fresh.stderr**2)
+        error = master.standard_error(start, times).square() + error_bars.of_mixtures(fresh, start)[1].square()
         covered_mixed = float((mixed.square() < error)[:, later].double().mean())
     return {
         "label": label,

@@ -21,6 +21,7 @@ from matplotlib.text import Text
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "experiments"))
 
 import chart_summary
+import error_bars
 import fig09
 import fig12
 import fig14
@@ -207,6 +208,17 @@ def test_run_all_reports_a_failure(tmp_path, capsys, monkeypatch):
     assert first.startswith("ok     fig12")
     assert second.startswith("FAILED no_such_script")
     assert (tmp_path / "fig12" / "figure.png").is_file()
+
+
+def test_the_error_of_a_mean_over_pairs_is_that_of_both_its_ensembles():
+    one, other = (torch.randn(n, 3, generator=torch.Generator().manual_seed(n), dtype=torch.float64) for n in (7, 5))
+    mean, error = error_bars.over_pairs(one[:, None] + other[None], False)
+    torch.testing.assert_close(mean, one.mean(0) + other.mean(0))
+    torch.testing.assert_close(error.square(), one.var(0) / 7 + other.var(0) / 5)
+    same = one[:, None] + one[None]
+    mean, error = error_bars.over_pairs(same + 1e6 * torch.eye(7, dtype=torch.float64)[..., None], True)  # none with itself
+    torch.testing.assert_close(mean, 2 * one.mean(0))
+    torch.testing.assert_close(error, 2 * (one.var(0) / 7).sqrt())
 
 
 def test_jackknife_of_a_mean_is_its_standard_error():
