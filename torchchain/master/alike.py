@@ -39,10 +39,8 @@ def factors(spread: Tensor, missed: Tensor, off: Tensor, error: Tensor) -> Tenso
         here = group == i
         one, two, three = (x[..., here, :] / unit[:, here] for x in (spread, missed, off[None]))
         replicas = max(len(spread) - 1, 1)
-        covariance = sum(
-            weight * torch.einsum("kstr,kutr->rsu", x, x)
-            for x, weight in ((one, 1 / replicas), (three, 1.0), (two, -1 / replicas))
-        )
+        weighted = ((one, 1 / replicas), (three, 1.0), (two, -1 / replicas))
+        covariance = torch.stack([weight * torch.einsum("kstr,kutr->rsu", x, x) for x, weight in weighted]).sum(0)
         size = covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()  # [receiver, source]
         both = size[:, :, None] * size[:, None, :]
         correlation = torch.where(
@@ -73,6 +71,7 @@ def variance(amplitudes: list[tuple[Tensor, Tensor]], shared: Tensor | None) -> 
             both = one * two if rest is None else one * two * rest
             total = total + (1 + (j > 0)) * torch.einsum("...s,str->...tr", first * second, both)
     for factor in () if shared is None else shared:
-        total = total + sum(torch.einsum("...s,str->...tr", w, x * factor) for w, x in amplitudes).square()
+        alike = [torch.einsum("...s,str->...tr", w, x * factor) for w, x in amplitudes]
+        total = total + torch.stack(alike).sum(0).square()
     assert isinstance(total, Tensor), "there is a source"
     return total.clamp(min=0)

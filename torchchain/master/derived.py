@@ -32,7 +32,7 @@ from torchchain.master.memory import MemoryModel
 from torchchain.master.model import Embedding, TransferModel
 from torchchain.master.proof import Certificate
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
-from torchchain.master.ringing import Degrees, Ringing, RingingRegression, checked, size_of
+from torchchain.master.ringing import Degrees, Ringing, RingingRegression, checked, size_of, smooth_of
 from torchchain.master.sample import Sample
 from torchchain.master.theory_rings import Ring, derived, shapes
 from torchchain.master.uncertainty import later_times
@@ -187,7 +187,7 @@ class TheoryModel(TransferModel):
     def _factor(self, times: Tensor, like: Tensor) -> Tensor:
         """Of each pair's odds, positive, [source, time, receiver]."""
         assert self.degrees_ is not None, "there are coefficients"
-        degrees = self.degrees_[:3]
+        degrees = smooth_of(self.degrees_)
         first, own = shapes(self.ring, degrees)
         clock = polynomials(clock_of(times), degrees[2])
         p, q = terms(degrees)
@@ -326,7 +326,7 @@ def _regression(sample: Sample, degrees: Degrees) -> tuple[Regression, TheoryMod
     assert sample.scene is not None, "checked"
     start = TheoryModel.of(sample.scene, degrees, torch.zeros(size_of(degrees), dtype=torch.float64))
     times, data, weight = fit_points(sample.times, sample.mean, sample.long_time, sample.distance)
-    smooth = degrees[:3]
+    smooth = smooth_of(degrees)
     found = Regression.of_odds(derived(start.ring, times), shapes(start.ring, smooth), smooth, times, data, weight)
     if len(degrees) == 5:
         found = RingingRegression.added(found, Ringing.of(start.ring, *degrees[3:]), times)
@@ -368,8 +368,7 @@ def _rungs(n_times: int) -> list[CompactSettings]:
 
 def _ringing_rungs(n_times: int) -> list[RingingSettings]:
     """The same of those that ring."""
-    known = [RingingSettings(degrees) for degrees in RINGING_LADDER]
-    return [each for each in known if each == known[0] or 2 * each.degrees[2] <= n_times]
+    return [RingingSettings(each) for each in RINGING_LADDER if each == RINGING_LADDER[0] or 2 * each[2] <= n_times]
 
 
 THEORY = ReducedModel(

@@ -44,6 +44,12 @@ def checked(degrees: Any) -> Degrees:
     return checked_degrees(degrees)
 
 
+def smooth_of(degrees: Degrees) -> tuple[int, int, int]:
+    """Those in place, distance and time."""
+    place, distance, time = degrees[:3]
+    return place, distance, time
+
+
 def size_of(degrees: Degrees) -> int:
     """Coefficients of a correction; they do not depend on the number of bands."""
     return n_coefficients(degrees[:3]) + (2 * degrees[4] * len(products(degrees[3])) if len(degrees) == 5 else 0)
