@@ -244,6 +244,19 @@ def test_a_step_of_gauss_and_newton_is_a_fit_to_other_data(transfers):
     assert float((changed.transfer(times) - exact).abs().max()) < 0.5 * float(step)
 
 
+def test_a_start_that_is_far_off_is_given_up(transfers):
+    problem = regression(
+        Waves.of(transfers[0].scene), DEGREES, transfers[0].times, transfers[0].mean, transfers[0].long_time
+    )
+    best, told = logistic.solve([problem], np.ones((1, 1)))
+    random = np.random.default_rng(0)
+    for size in (3.0, 30.0, 300.0):  # exponents of hundreds are cut off, and no step changes anything
+        start = size * random.normal(size=best.shape)
+        _, report = logistic.solve([problem], np.ones((1, 1)), start)
+        assert report["misfit"] < 1.05 * told["misfit"]
+        assert report["converged"]
+
+
 def test_fits_are_deterministic(transfers):
     own, _ = transfers
     assert torch.equal(fitted(own)[0].coefficients, fitted(own)[0].coefficients)
@@ -393,7 +406,9 @@ def test_what_noise_explains_is_no_error_of_the_model():
     stderr = torch.full((5, 9, 5), 1e-3, dtype=torch.float64)
     mean = torch.zeros_like(stderr)
     assert float(model_error(mean + 0.9e-3, mean, stderr, stderr).max()) == 0
-    torch.testing.assert_close(model_error(mean + 1e-3, mean, stderr, 0.6 * stderr), 0.8 * stderr)  # noise that was followed hides less
+    torch.testing.assert_close(
+        model_error(mean + 1e-3, mean, stderr, 0.6 * stderr), 0.8 * stderr
+    )  # noise that was followed hides less
     with pytest.raises(FieldError, match="noise must have shape"):
         model_error(mean, mean, stderr, stderr[:2])
 

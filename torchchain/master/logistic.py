@@ -146,7 +146,7 @@ def solve(
     Args:
         regressions: of the same degrees, each a :class:`Regression` or like one.
         mixing: weight of each of the common sets of coefficients in each regression, (regression, set).
-        start: (set, coefficient); zero if None.
+        start: (set, coefficient); zero if None, and where it leads nowhere.
         progress: called with 1 after each step.
         stiffness: against each of the sets, (set,), beside the ridge; none if None.
 
@@ -186,6 +186,10 @@ def solve(
         if gained < 1e-3 * now:
             converged = True
             break
+    if (
+        start is not None and now > misfits(np.zeros_like(found))[0]
+    ):  # lost: exponents so large that nothing changes with them
+        return solve(regressions, mixing, None, progress, stiffness)
     count = sum(r.data.size for r in regressions)
     return found, {"converged": converged, "steps": steps, "misfit": math.sqrt(now / count)}
 
