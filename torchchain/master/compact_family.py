@@ -340,7 +340,9 @@ def joined(members: Sequence[MasterEquation]) -> list[MasterEquation]:
             before, now = (each.transfer(errors.times).detach() for each in (member.model, model))
             noise, misfit = errors.parts(errors.times)
             off = model_error(now, before, errors.stderr, torch.zeros_like(now))
-            errors = of_parts(errors.rates_stderr, errors.basis_stderr, errors.times, noise, misfit + off.square(), errors.alike)
+            errors = of_parts(
+                errors.rates_stderr, errors.basis_stderr, errors.times, noise, misfit + off.square(), errors.alike
+            )
         record = member.calibration
         report = replace(record.report, fit=told, certificate=model.certificate)
         again.append(MasterEquation(model, replace(record, method="logistic", model="compact", report=report), errors))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from torchchain.master.sample import Sample, block_weights
 from torchchain.master.waves import Waves
 from torchchain.threads import single_blas_thread
 
+Degrees = TypeVar("Degrees", bound=tuple[int, ...])
 LADDER = ((4, 3, 6), (6, 4, 8), (8, 6, 12), (10, 7, 14), (10, 7, 20), (14, 10, 20))
 """Degrees in place, distance and time that are tried one after the other: 53 to 480 fitted numbers, and 806."""
 
@@ -158,9 +160,13 @@ def replicas(transfer: BandTransfer, recipe: Recipe, model: CompactModel, repeat
     yield from redrawn(transfer, model, recipe.window, repeats, drawn, others)
 
 
+def told_apart(ladder: Sequence[Degrees], n_times: int) -> list[Degrees]:
+    """Of degrees in place, distance, time and more those that so many times can tell apart, the smallest at least."""
+    return [degrees for degrees in ladder if degrees == ladder[0] or 2 * degrees[2] <= n_times]
+
+
 def _rungs(n_times: int) -> list[CompactSettings]:
-    """The degrees that so many times can tell apart, the smallest at least."""
-    return [CompactSettings(degrees) for degrees in LADDER if degrees == LADDER[0] or 2 * degrees[2] <= n_times]
+    return [CompactSettings(degrees) for degrees in told_apart(LADDER, n_times)]
 
 
 COMPACT = ReducedModel(

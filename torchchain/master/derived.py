@@ -25,7 +25,7 @@ from torchchain import checks
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.compact import clock_of, nearest_memory, polynomials, power, terms
-from torchchain.master.compact_record import CompactReport, CompactSettings, drawn_again
+from torchchain.master.compact_record import CompactReport, CompactSettings, drawn_again, told_apart
 from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import BEYOND, Regression, fit_points, solve, stepped
 from torchchain.master.memory import MemoryModel
@@ -362,13 +362,11 @@ def _again(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: 
 
 
 def _rungs(n_times: int) -> list[CompactSettings]:
-    """The degrees that so many times can tell apart, the smallest at least."""
-    return [CompactSettings(degrees) for degrees in LADDER if degrees == LADDER[0] or 2 * degrees[2] <= n_times]
+    return [CompactSettings(degrees) for degrees in told_apart(LADDER, n_times)]
 
 
 def _ringing_rungs(n_times: int) -> list[RingingSettings]:
-    """The same of those that ring."""
-    return [RingingSettings(each) for each in RINGING_LADDER if each == RINGING_LADDER[0] or 2 * each[2] <= n_times]
+    return [RingingSettings(degrees) for degrees in told_apart(RINGING_LADDER, n_times)]
 
 
 THEORY = ReducedModel(

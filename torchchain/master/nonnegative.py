@@ -141,11 +141,12 @@ def nonnegative(
             model.damping,
         )
 
-    def misfit(amplitudes: np.ndarray) -> float:
-        fitted = bare.functions(grid) @ amplitudes.reshape(len(amplitudes), -1)
-        return float(np.linalg.norm((fitted - rest.transpose(1, 0, 2).reshape(len(grid), -1)) * weight[:, None]))
+    weighted = Space(*poles, np.zeros(0), np.zeros(0)).functions(grid) * weight[:, None]
+    wanted = rest.transpose(1, 0, 2).reshape(len(grid), -1) * weight[:, None]
 
-    bare = Space(*poles, np.zeros(0), np.zeros(0))
+    def misfit(amplitudes: np.ndarray) -> float:
+        return float(np.linalg.norm(weighted @ amplitudes.reshape(len(amplitudes), -1) - wanted))
+
     failed: tuple[MemoryModel, Certificate] | None = None
     best: tuple[float, MemoryModel, Certificate] | None = None
     for cut in CUTS:
