@@ -97,7 +97,7 @@ System = Chain | Lattice
 
 
 def _energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
-    return systems.particle_energy(chain, trajectory, scene.energy_definition)
+    return spreading.particle_energy(chain, trajectory, scene.energy_definition)
 
 
 def _source_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
@@ -106,7 +106,7 @@ def _source_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tenso
 
 def _dissipated(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
     if isinstance(chain, Lattice):
-        return systems.total_energy(chain, _start(scene, chain, trajectory)) - systems.total_energy(chain, trajectory)
+        return spreading.total_energy(chain, _start(scene, chain, trajectory)) - spreading.total_energy(chain, trajectory)
     return torch.zeros_like(trajectory.displacement[..., 0]) if trajectory.dissipated is None else trajectory.dissipated
 
 
@@ -127,7 +127,7 @@ def _band_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
         )
         if scene.largest_damping == 0:
             return share
-    return share / systems.total_energy(chain, _start(scene, chain, trajectory))[..., None]
+    return share / spreading.total_energy(chain, _start(scene, chain, trajectory))[..., None]
 
 
 def _kicked_band_energy(scene: Scene, chain: Chain, trajectory: Trajectory) -> Tensor:
@@ -248,7 +248,7 @@ for _one in (
         lambda s, c, t: spreading.energy_spread(c, _energy(s, c, t), s.site), kinds=LATTICES,
     ),
     Observable(
-        "total_energy", ("time",), _JOULE, "total energy", lambda s, c, t: systems.total_energy(c, t), local=True, passes=12,
+        "total_energy", ("time",), _JOULE, "total energy", lambda s, c, t: spreading.total_energy(c, t), local=True, passes=12,
         kernel="total",
     ),
     Observable(

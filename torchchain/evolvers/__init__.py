@@ -9,7 +9,7 @@ from torchchain.chain import amplitude, scaling
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.evolvers import chebyshev, damped, modes, ode, symplectic4, tridiagonal, verlet
-from torchchain.evolvers.method import METHODS, Advance, Method, register_method
+from torchchain.evolvers.method import METHODS, Advance, Method, chosen, register_method
 
 for _method in (
     modes.METHOD, tridiagonal.METHOD, chebyshev.METHOD, verlet.METHOD, symplectic4.METHOD, damped.METHOD, *ode.METHODS
@@ -37,9 +37,7 @@ def evolved(
 def start(chain: Chain, state: State, method: str, **options: Any) -> Advance:
     """The start of an evolution whose times come in windows; see :class:`Method`."""
     checks.instance("chain", chain, Chain)
-    checks.instance("state", state, State)
-    entry = METHODS[checks.choice("method", method, METHODS)]
-    checks.known_keys(f"options of method '{method}'", options, entry.options)
+    entry = chosen(METHODS, chain, state, method, options)
     n = chain.n_particles
     if state.displacement.shape[-1] != n:
         raise checks.fail("state", f"have {n} particles like the chain", f"shape {tuple(state.displacement.shape)}")
@@ -48,10 +46,4 @@ def start(chain: Chain, state: State, method: str, **options: Any) -> Advance:
         raise checks.fail("boundary", f"be {' or '.join(entry.boundaries)} for method '{method}'", repr(chain.boundary))
     if chain.contact not in entry.contacts:
         raise checks.fail("contact", f"be {' or '.join(entry.contacts)} for method '{method}'", repr(chain.contact))
-    if chain.is_damped and not entry.damped:
-        raise checks.fail(
-            "damping",
-            f"be zero for method '{method}' (methods with damping: {', '.join(name for name, m in METHODS.items() if m.damped)})",
-            f"up to {chain.contact_damping.max().item():g}",
-        )
     return entry.start(chain, state, **options)

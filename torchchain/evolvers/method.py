@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain.states import Trajectory
+from torchchain.chain.states import State, Trajectory
 
 Advance = Callable[[Tensor], Trajectory]
 """Called with consecutive windows of output times, returns the states at them."""
@@ -81,6 +82,21 @@ class Method:
 
 METHODS: dict[str, Method] = {}
 """All methods by name."""
+
+
+def chosen(methods: dict[str, Method], system: Any, state: State, method: str, options: dict[str, Any]) -> Method:
+    """The record of a method, if it has these options and treats what damps like the system, a chain or a network."""
+    checks.instance("state", state, State)
+    entry = methods[checks.choice("method", method, methods)]
+    checks.known_keys(f"options of method '{method}'", options, entry.options)
+    if system.is_damped and not entry.damped:
+        others = ", ".join(name for name, m in methods.items() if m.damped)
+        raise checks.fail(
+            "damping",
+            f"be zero for method '{method}' (methods with damping: {others})",
+            f"up to {system.damping.max().item():g}",
+        )
+    return entry
 
 
 def register_method(method: Method) -> Method:

@@ -13,7 +13,7 @@ from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
 from torchchain.frames.record import AXES, Frame, FramesWarning
-from torchchain.network import Network, total_energy
+from torchchain.network import Network
 
 CHANGED = 0.01  # share of the energy that an undamped run may gain or lose before a warning
 NOISE = 1e-3  # share of the displacement that the digits of the positions may leave out
@@ -118,12 +118,8 @@ def check_energy(name: str, chain: Chain | Network, path: Trajectory) -> None:
     """
     if chain.is_damped:
         return
-    if isinstance(chain, Network):
-        energy, kind = total_energy(chain, path), "network"
-    else:
-        kinetic = (chain.align(chain.masses, path.velocity) * path.velocity.square()).sum(-1) / 2
-        energy, kind = kinetic + chain.contact_energy(path.displacement).sum(-1), "chain"
-    total = energy.detach().reshape(-1, len(path.times))
+    kind = "network" if isinstance(chain, Network) else "chain"
+    total = chain.energy(path.displacement, path.velocity).detach().reshape(-1, len(path.times))
     start = total[:, :1]
     change = torch.where(start > 0, total / start - 1, 0.0)
     worst = int(change.abs().argmax())

@@ -20,7 +20,7 @@ from torchchain.network.energy import (
     radial_profile,
     total_energy,
 )
-from torchchain.network.evolvers import METHODS, begin, evolve
+from torchchain.network.evolvers import METHODS, begin
 from torchchain.network.lattices import Lattice, dispersion, lattice
 from torchchain.network.modes import (
     FloppyWarning,
@@ -29,7 +29,6 @@ from torchchain.network.modes import (
     UnstableError,
     check_stability,
     components,
-    normal_modes,
     rigid_motions,
     softness,
 )
@@ -46,6 +45,7 @@ from torchchain.network.spectra import (
     spectral_moments,
     structure_factor,
 )
+from torchchain.network.systems import evolve, normal_modes
 from torchchain.network.trajectories import NetworkTrajectory
 from torchchain.network.verlet import grain_energy
 from torchchain.network.wavenumber import (

@@ -36,21 +36,15 @@ def start(network: Network, state: State) -> Advance:
     members = y.shape[batch:-1]
     y = y.reshape(*network.batch_shape, -1, 2 * n * c)
     propagate = by_exponentials(matrix, y)
-    initial = _energy(network, state.displacement, state.velocity)
+    initial = network.energy(state.displacement, state.velocity)
 
     def advance(times: Tensor) -> NetworkTrajectory:
         z = propagate(times).reshape(*network.batch_shape, *members, len(times), 2, n, c)
         u, v = (part / field.unsqueeze(-3) for part in z.unbind(-3))
         u = u / top[..., None, None]
-        return NetworkTrajectory(times, u, v, dissipated=initial[..., None] - _energy(network, u, v))
+        return NetworkTrajectory(times, u, v, dissipated=initial[..., None] - network.energy(u, v))
 
     return advance
-
-
-def _energy(network: Network, displacement: Tensor, velocity: Tensor) -> Tensor:
-    """Energy of every state, (*batch, *any)."""
-    kinetic = (network.align(network.masses, velocity) * velocity.square()).sum((-2, -1)) / 2
-    return kinetic + network.bond_energy(displacement).sum(-1)
 
 
 METHOD = Method(

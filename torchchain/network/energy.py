@@ -1,4 +1,4 @@
-"""Where the energy of a network is: per particle, per bond, and its spreading from a point."""
+"""Where the energy of a chain or a network is: per particle, per bond; and its spreading from a point of a network."""
 
 from __future__ import annotations
 
@@ -8,75 +8,79 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
+from torchchain.energy import space
 from torchchain.energy.space import positive
 from torchchain.network.networks import Network
 from torchchain.network.trajectories import check_trajectory
 
-DEFINITIONS = ("bond", "site")
 
-
-def kinetic_energy(network: Network, trajectory: Trajectory) -> Tensor:
-    """Kinetic energy of every particle, (*batch, time, particle).
-
-    Args:
-        network: the network of the trajectory.
-        trajectory: velocity (*batch, time, particle, component).
+def kinetic_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
+    """Kinetic energy of every particle of a chain (Eq. 30) or a network, (*batch, time, particle).
 
     Example:
-        >>> sheet = tc.lattice("triangular", (4, 4))
-        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0], method="modes")
-        >>> tc.network.kinetic_energy(sheet, path).sum().item()  # the wave starts at rest
-        0.0
+        >>> ring = tc.Chain(tc.Disorder(strength=0.2).masses(32, 1, seed=0))
+        >>> path = tc.evolve(ring, tc.standing_wave(ring, tone=3), [0.0, 5.0])
+        >>> tc.kinetic_energy(ring, path).shape
+        torch.Size([1, 2, 32])
     """
-    _, velocity = check_trajectory(network, trajectory)
-    return (network.align(network.masses, velocity) * velocity.square()).sum(-1) / 2
+    if not isinstance(chain, Network):
+        return space.kinetic_energy(chain, trajectory)
+    return chain.kinetic_energy(check_trajectory(chain, trajectory)[1])
 
 
-def bond_energy(network: Network, trajectory: Trajectory) -> Tensor:
-    """Energy stored in every bond, (*batch, time, bond); negative where a pushing bond turns more than it stretches.
+def bond_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
+    """Energy stored in every contact of a chain or bond of a network, (*batch, time, contact | bond).
 
-    Args:
-        network: the network of the trajectory.
-        trajectory: displacement (*batch, time, particle, component).
+    That of a bond is negative where it pushes and turns more than it stretches.
 
     Example:
-        >>> sheet = tc.lattice("triangular", (4, 4))
-        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0], method="modes")
-        >>> torch.allclose(tc.network.bond_energy(sheet, path).sum(-1), tc.network.total_energy(sheet, path))  # at rest
-        True
+        >>> sheet = tc.lattice("triangular", (8, 8))
+        >>> motion = tc.evolve(sheet, tc.network.plane_wave(sheet, (2, 0)), [0.0, 5.0])
+        >>> tc.bond_energy(sheet, motion).shape  # three bonds a particle
+        torch.Size([2, 192])
     """
-    displacement, _ = check_trajectory(network, trajectory)
-    return network.bond_energy(displacement)
+    if isinstance(chain, Network):
+        return chain.bond_energy(check_trajectory(chain, trajectory)[0])
+    space.checked(chain, trajectory)
+    return checks.finite("energy of trajectory", chain.contact_energy(trajectory.displacement), "contact")
 
 
-def particle_energy(network: Network, trajectory: Trajectory, definition: str = "bond") -> Tensor:
-    """Energy of every particle, (*batch, time, particle); the sum is :func:`total_energy` by either definition.
+def particle_energy(chain: Chain | Network, trajectory: Trajectory, definition: str | None = None) -> Tensor:
+    """Total energy of every particle of a chain (Eq. 36) or a network, (*batch, time, particle).
 
     Args:
-        network: the network of the trajectory.
-        trajectory: displacement and velocity (*batch, time, particle, component).
-        definition: "bond": half of the energy of each of its bonds (all of a bond to an anchor) besides the kinetic;
-            "site": u . K u / 2 instead, which is negative on many particles; of a network without anchors u is counted
-            from its center of mass, as the particle energies would otherwise grow with the drift of the whole.
+        chain: a chain or a network.
+        trajectory: its states in time.
+        definition: "site", -F u / 2 besides the kinetic energy (Eq. 36), or "bond", half of the energy of each of a
+            particle's contacts (Eq. A3), and all of one with a wall or an anchor. None: "site" for a chain, "bond" for a
+            network. Without walls or anchors u is counted from the center of mass for "site", as the particle energies
+            would otherwise grow with the drift of the whole. The sum is :func:`total_energy` by either.
 
-    Example:
-        >>> sheet = tc.lattice("triangular", (4, 4))
-        >>> path = tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0, 5.0], method="modes")
-        >>> tuple(tc.network.particle_energy(sheet, path).shape)
-        (2, 16)
+    Raises:
+        FieldError: for states of another system, or "site" for Hertz contacts.
+
+    >>> import torch, torchchain as tc
+    >>> network = tc.lattice("triangular", (4, 4))
+    >>> kick = torch.zeros(16, 2, dtype=torch.float64)
+    >>> kick[0, 0] = 1.0
+    >>> path = tc.evolve(network, tc.State(torch.zeros_like(kick), kick), [0.0, 1.0])
+    >>> tc.particle_energy(network, path).sum(-1)
+    tensor([0.5000, 0.5000], dtype=torch.float64)
     """
-    checks.choice("definition", definition, DEFINITIONS)
-    kinetic = kinetic_energy(network, trajectory)
-    if definition == "site":
-        displacement = trajectory.displacement
-        place = displacement if network.n_anchors else displacement - center_of_mass(network, displacement)
-        return kinetic - (network.force(displacement) * place).sum(-1) / 2
-    bond = network.bond_energy(trajectory.displacement)
-    i, j = network.bonds.unbind(-1)
-    n = network.n_particles
+    if not isinstance(chain, Network):
+        return space.particle_energy(chain, trajectory, "site" if definition is None else definition)
+    kinetic = kinetic_energy(chain, trajectory)
+    displacement = trajectory.displacement
+    if checks.choice("definition", "bond" if definition is None else definition, space.DEFINITIONS) == "site":
+        place = displacement if chain.n_anchors else displacement - center_of_mass(chain, displacement)
+        return kinetic - (chain.force(displacement) * place).sum(-1) / 2
+    bond = chain.bond_energy(displacement)
+    i, j = chain.bonds.unbind(-1)
+    n = chain.n_particles
     share = torch.where((i >= n) | (j >= n), 1.0, 0.5).to(bond) * bond
-    stored = bond.new_zeros(*bond.shape[:-1], n + network.n_anchors)
+    stored = bond.new_zeros(*bond.shape[:-1], n + chain.n_anchors)
     stored = stored.index_add(-1, i, share).index_add(-1, j, share)
     return kinetic + stored[..., :n]
 
@@ -87,20 +91,19 @@ def center_of_mass(network: Network, displacement: Tensor) -> Tensor:
     return (masses * displacement).sum(-2, keepdim=True) / masses.sum(-2, keepdim=True)
 
 
-def total_energy(network: Network, trajectory: Trajectory) -> Tensor:
-    """Energy of the whole network, (*batch, time).
-
-    Args:
-        network: any.
-        trajectory: displacement and velocity (*batch, time, particle, component).
+def total_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
+    """Energy of a whole chain (Eq. 41) or network relative to its state of rest, (*batch, time).
 
     Example:
-        >>> sheet = tc.network.disordered(tc.lattice("triangular", (6, 6)), tc.Disorder(strength=0.3), seed=0)
-        >>> energy = tc.network.total_energy(sheet, tc.evolve(sheet, tc.network.plane_wave(sheet, (1, 0)), [0.0, 50.0], method="modes"))
-        >>> torch.allclose(energy[..., 0], energy[..., 1])
+        >>> ring = tc.Chain(tc.Disorder(strength=0.2).masses(32, 1, seed=0))
+        >>> path = tc.evolve(ring, tc.standing_wave(ring, tone=3), [0.0, 5.0])
+        >>> energy = tc.total_energy(ring, path)[0]
+        >>> bool((energy[1] / energy[0] - 1).abs() < 1e-12)
         True
     """
-    return kinetic_energy(network, trajectory).sum(-1) + bond_energy(network, trajectory).sum(-1)
+    if not isinstance(chain, Network):
+        return space.total_energy(chain, trajectory)
+    return chain.energy(*check_trajectory(chain, trajectory))
 
 
 def distances(network: Network, origin: int | Any) -> Tensor:

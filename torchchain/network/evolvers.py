@@ -6,8 +6,7 @@ from typing import Any
 
 from torchchain import checks
 from torchchain.chain import State
-from torchchain.chain.states import Trajectory
-from torchchain.evolvers.method import Advance, Method
+from torchchain.evolvers.method import Advance, Method, chosen
 from torchchain.network import chebyshev, damped, modal, verlet
 from torchchain.network.networks import Network
 
@@ -16,40 +15,14 @@ METHODS: dict[str, Method] = {
 }
 
 
-def evolve(network: Network, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:
-    """States of the network at the given times.
-
-    >>> import torch
-    >>> from torchchain.chain import State
-    >>> from torchchain.network import lattice
-    >>> ring = lattice("triangular", (4, 4))
-    >>> kick = torch.zeros(16, 2, dtype=torch.float64)
-    >>> kick[0, 0] = 1.0
-    >>> evolve(ring, State(torch.zeros_like(kick), kick), [0.0, 1.0], "chebyshev").velocity.shape
-    torch.Size([2, 16, 2])
-
-    Args:
-        network: masses (*batch, particle).
-        state: the start at time 0, (*batch, *any, particle, component).
-        times: (time,), increasing, not negative.
-        method: a name in ``METHODS``; each entry states its order, stability, cost and limits.
-        options: the method's own.
-
-    Returns:
-        Trajectory with displacement and velocity (*batch, *any, time, particle, component).
-
-    Raises:
-        FieldError, FieldTypeError: for times, a method, an option or a network that the method cannot treat.
-        UnstableError: for a network whose prestress makes it unstable.
-    """
-    return begin(network, state, method, **options)(checks.times("times", times).to(state.displacement.device))
-
-
 def begin(network: Network, state: State, method: str, **options: Any) -> Advance:
     """The start of an evolution whose times come in windows.
 
     Args:
-        network, state, method, options: as for :func:`evolve`.
+        network: masses (*batch, particle).
+        state: the start at time 0, (*batch, *any, particle, component).
+        method: a name in ``METHODS``; each entry states its order, stability, cost and limits.
+        options: the method's own.
 
     Returns:
         A function of increasing windows of times (time,), which gives their NetworkTrajectory.
@@ -61,11 +34,6 @@ def begin(network: Network, state: State, method: str, **options: Any) -> Advanc
         (2, 16, 2)
     """
     checks.instance("network", network, Network)
-    checks.instance("state", state, State)
-    entry = METHODS[checks.choice("method", method, METHODS)]
-    checks.known_keys(f"options of method '{method}'", options, entry.options)
+    entry = chosen(METHODS, network, state, method, options)
     network.check_state(state.displacement)
-    if network.is_damped and not entry.damped:
-        others = ", ".join(name for name, m in METHODS.items() if m.damped)
-        raise checks.fail("damping", f"be zero for method '{method}' (methods with damping: {others})", "more")
     return entry.start(network, state, **options)

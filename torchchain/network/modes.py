@@ -97,28 +97,10 @@ class Softness:
 
 
 def normal_modes(network: Network) -> NetworkModes:
-    """Normal modes of a network (or of a packing about its state).
+    """Normal modes of a network (or of a packing about its state); see :func:`torchchain.normal_modes`.
 
     Decomposes M^-1/2 K M^-1/2, all networks of a batch at once, and takes each w^2 anew from the mode's bonds, sum of
     e . C e, which is accurate relative to w itself where the solver's is accurate only relative to the largest.
-
-    >>> import torch
-    >>> from torchchain.network import lattice
-    >>> normal_modes(lattice("chain", (4,))).frequencies.round(decimals=6)
-    tensor([0.0000, 1.4142, 1.4142, 2.0000], dtype=torch.float64)
-
-    Args:
-        network: without damping; n_particles * n_components unknowns.
-
-    Returns:
-        NetworkModes, dtype and device of the masses.
-
-    Raises:
-        UnstableError: naming the lowest squared frequency, if it is negative beyond rounding.
-        FieldError: for a damped network, or one too large to decompose.
-
-    Warns:
-        FloppyWarning: for zero modes besides the rigid motions of the whole, counting them.
     """
     checks.instance("network", network, Network)
     n, c = network.n_particles, network.n_components
@@ -166,7 +148,7 @@ def _unstable(squared: float, count: int | None, where: tuple[int, ...] = ()) ->
 def _warn_if_floppy(network: Network, zero_modes: int) -> None:
     if zero_modes > rigid_motions(network):
         soft = describe_softness(network, zero_modes)
-        warnings.warn(f"the network has {soft}", FloppyWarning, stacklevel=3)
+        warnings.warn(f"the network has {soft}", FloppyWarning, stacklevel=4)
 
 
 def softness(network: Network) -> Softness:

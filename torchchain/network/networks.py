@@ -280,6 +280,14 @@ class Network:
         elongation = self.elongation(displacement)
         return (self.bond_force(elongation) * elongation).sum(-1) / 2
 
+    def kinetic_energy(self, velocity: Tensor) -> Tensor:
+        """Of every particle, (*batch, *any, particle)."""
+        return (self.align(self.masses, velocity) * velocity.square()).sum(-1) / 2
+
+    def energy(self, displacement: Tensor, velocity: Tensor) -> Tensor:
+        """Energy of the whole network relative to its state of rest, (*batch, *any)."""
+        return self.kinetic_energy(velocity).sum(-1) + self.bond_energy(displacement).sum(-1)
+
     def bond_matrices(self) -> Tensor:
         """C of every bond, (*batch, bond, component, component)."""
         stiffness = self.bond_stiffness[..., None, None]

@@ -9,14 +9,13 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
-from torchchain.energy import space, wavenumber
+from torchchain.energy import wavenumber
 from torchchain.evolvers import evolved
 from torchchain.modes import spectrum
 from torchchain.modes.spectrum import NormalModes
 from torchchain.network import bands
-from torchchain.network import energy as network_space
-from torchchain.network import evolvers as networks
 from torchchain.network import wavenumber as network_wavenumber
+from torchchain.network.evolvers import begin
 from torchchain.network.lattices import Lattice
 from torchchain.network.modes import NetworkModes
 from torchchain.network.modes import normal_modes as network_modes
@@ -39,6 +38,7 @@ def evolve(chain: Chain | Network, state: State, times: Any, method: str = "mode
 
     Raises:
         FieldError, FieldTypeError: for times, a method, an option or a system that the method cannot treat.
+        UnstableError: for a network whose prestress makes it unstable.
 
     Warns:
         LinearityWarning: for linear contacts of a chain that the start would open (elongation 1, the initial overlap).
@@ -50,7 +50,7 @@ def evolve(chain: Chain | Network, state: State, times: Any, method: str = "mode
     torch.Size([2, 3, 16])
     """
     if isinstance(chain, Network):
-        return networks.evolve(chain, state, times, method, **options)
+        return begin(chain, state, method, **options)(checks.times("times", times).to(state.displacement.device))
     return evolved(chain, state, times, method, options, stacklevel=4)
 
 
@@ -73,79 +73,18 @@ def normal_modes(chain: Chain | Network) -> NormalModes | NetworkModes:
         network.
 
     Raises:
-        FieldError: for a damped system.
-        DecompositionError, UnstableError: for modes that fail the check, or a network that its prestress makes unstable.
+        FieldError: for a damped system, or a network too large to decompose.
+        DecompositionError, UnstableError: for modes that fail the check, or a network that its prestress makes unstable,
+            naming the lowest squared frequency.
+
+    Warns:
+        FloppyWarning: for zero modes of a network besides the rigid motions of the whole, counting them.
 
     >>> import torch, torchchain as tc
     >>> tc.normal_modes(tc.Chain(torch.ones(4, dtype=torch.float64))).frequencies.round(decimals=4)
     tensor([0.0000, 1.4142, 1.4142, 2.0000], dtype=torch.float64)
     """
     return network_modes(chain) if isinstance(chain, Network) else spectrum.normal_modes(chain)
-
-
-def particle_energy(chain: Chain | Network, trajectory: Trajectory, definition: str | None = None) -> Tensor:
-    """Total energy of every particle of a chain (Eq. 36) or a network, (*batch, time, particle).
-
-    Args:
-        chain: a chain or a network.
-        trajectory: its states in time.
-        definition: "site", -F u / 2 besides the kinetic energy (Eq. 36), or "bond", half of the energy of each of a
-            particle's contacts (Eq. A3). None: "site" for a chain, "bond" for a network.
-
-    Raises:
-        FieldError: for states of another system, or "site" for Hertz contacts.
-
-    >>> import torch, torchchain as tc
-    >>> network = tc.lattice("triangular", (4, 4))
-    >>> kick = torch.zeros(16, 2, dtype=torch.float64)
-    >>> kick[0, 0] = 1.0
-    >>> path = tc.evolve(network, tc.State(torch.zeros_like(kick), kick), [0.0, 1.0])
-    >>> tc.particle_energy(network, path).sum(-1)
-    tensor([0.5000, 0.5000], dtype=torch.float64)
-    """
-    if isinstance(chain, Network):
-        return network_space.particle_energy(chain, trajectory, "bond" if definition is None else definition)
-    return space.particle_energy(chain, trajectory, "site" if definition is None else definition)
-
-
-def kinetic_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
-    """Kinetic energy of every particle of a chain (Eq. 30) or a network, (*batch, time, particle).
-
-    Example:
-        >>> ring = tc.Chain(tc.Disorder(strength=0.2).masses(32, 1, seed=0))
-        >>> path = tc.evolve(ring, tc.standing_wave(ring, tone=3), [0.0, 5.0])
-        >>> tc.kinetic_energy(ring, path).shape
-        torch.Size([1, 2, 32])
-    """
-    return (network_space if isinstance(chain, Network) else space).kinetic_energy(chain, trajectory)
-
-
-def total_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
-    """Energy of a whole chain (Eq. 41) or network relative to its state of rest, (*batch, time).
-
-    Example:
-        >>> ring = tc.Chain(tc.Disorder(strength=0.2).masses(32, 1, seed=0))
-        >>> path = tc.evolve(ring, tc.standing_wave(ring, tone=3), [0.0, 5.0])
-        >>> energy = tc.total_energy(ring, path)[0]
-        >>> bool((energy[1] / energy[0] - 1).abs() < 1e-12)
-        True
-    """
-    return (network_space if isinstance(chain, Network) else space).total_energy(chain, trajectory)
-
-
-def bond_energy(chain: Chain | Network, trajectory: Trajectory) -> Tensor:
-    """Energy stored in every contact of a chain or bond of a network, (*batch, time, contact | bond).
-
-    Example:
-        >>> sheet = tc.lattice("triangular", (8, 8))
-        >>> motion = tc.evolve(sheet, tc.network.plane_wave(sheet, (2, 0)), [0.0, 5.0])
-        >>> tc.bond_energy(sheet, motion).shape  # three bonds a particle
-        torch.Size([2, 192])
-    """
-    if isinstance(chain, Network):
-        return network_space.bond_energy(chain, trajectory)
-    space.checked(chain, trajectory)
-    return checks.finite("energy of trajectory", chain.contact_energy(trajectory.displacement), "contact")
 
 
 def wavenumber_energy(chain: Chain | Network, trajectory: Trajectory, definition: str = "site") -> Tensor:

@@ -197,8 +197,7 @@ def grain_energy(network: Packing, trajectory: NetworkTrajectory) -> Tensor:
 
     displacement, velocity = trajectory.displacement, trajectory.velocity
     length = (network.bond_vectors + network.elongation(displacement)).square().sum(-1).sqrt()
-    kinetic = (network.align(network.masses, velocity) * velocity.square()).sum((-2, -1)) / 2
-    return kinetic + (stored(length) - stored(network.lengths)).sum(-1)
+    return network.kinetic_energy(velocity).sum(-1) + (stored(length) - stored(network.lengths)).sum(-1)
 
 
 METHOD = Method(
