@@ -386,6 +386,7 @@ BASE = tc.Scene(**COMMON)
             "excitation.tones must lie one in each of the 4 bands, in order",
         ),
         (lambda: tc.simulate(BASE, "mode"), FieldError, "method must be one of .*, got 'mode'"),
+        (lambda: tc.band_transfer(BASE, "theroy"), FieldError, "method must be one of .*, theory, got .*; did you mean theory"),
         (lambda: tc.simulate(BASE, None), FieldTypeError, "method must be a string"),
         (lambda: tc.simulate(BASE, "modes", memory_budget=0), FieldError, "memory_budget must be at least 1"),
         (lambda: tc.simulate(BASE, "modes", memory_budget=1.5), FieldTypeError, "memory_budget must be an integer"),

@@ -7,7 +7,7 @@ import xarray
 
 import torchchain as tc
 from torchchain import cli
-from torchchain.checks import FieldError
+from torchchain.checks import FieldError, FieldTypeError
 from torchchain.ensemble import footprint
 from torchchain.ensemble.checkpoint import Checkpoint
 from torchchain.ensemble.moving_part import moving_part
@@ -91,6 +91,14 @@ def test_names_are_taken_once_and_records_are_checked():
         Observable("x", ("time",), "1", "x")
     with pytest.raises(FieldError, match=r"observable.name must be a name that does not end in _stderr"):
         Observable("energy_stderr", ("time",), "1", "x", peak)
+    with pytest.raises(FieldError, match="observable.name must be no axis of the results, got 'time'"):
+        Observable("time", ("time",), "1", "x", peak)
+    with pytest.raises(FieldTypeError, match="observable.unit must be a str, got 1"):
+        Observable("x", ("time",), 1, "x", peak)
+    with pytest.raises(FieldTypeError, match="observable must compute by a function, got 3"):
+        Observable("x", ("time",), "1", "x", 3)
+    with pytest.raises(FieldTypeError, match="observable must be an Observable, got 'peak'"):
+        tc.register_observable("peak")
     with pytest.raises(FieldError, match="observables must be one of band_energy, .*, got 'peak'"):
         scene(observables=("peak",))
 
@@ -100,6 +108,12 @@ def test_an_observable_of_the_wrong_shape_is_named(monkeypatch):
     monkeypatch.setitem(OBSERVABLES, "wrong", wrong)
     with pytest.raises(FieldError, match=r"observable wrong must give shape \(1, 3\), got shape \(1, 3, 16\)"):
         tc.simulate(scene(n_particles=16, excitation=tc.Impulse(8), observables=("wrong",), realizations=1), "modes")
+
+
+def test_an_observable_of_complex_numbers_is_named(monkeypatch):
+    monkeypatch.setitem(OBSERVABLES, "wave", Observable("wave", ("time",), "1", "x", lambda *given: 1j * peak(*given)))
+    with pytest.raises(FieldError, match="observable wave must give real numbers, got torch.complex128"):
+        tc.simulate(scene(n_particles=16, excitation=tc.Impulse(8), observables=("wave",), realizations=1), "modes")
 
 
 def test_an_average_of_ones_own(monkeypatch):

@@ -2,9 +2,10 @@
 
 import pytest
 import torch
-from torch.func import grad, vmap
+from torch.func import grad, jacrev, vmap
 
 import torchchain as tc
+from torchchain.checks import FieldError
 from torchchain.evolvers import METHODS, kernels, register_method
 
 TIMES = [0.5, 3.0, 20.0]
@@ -38,6 +39,30 @@ def test_grad_and_vmap_give_what_backward_and_a_batch_give(method, options, boun
             torch.testing.assert_close(gradient, leaf.grad, rtol=1e-8, atol=1e-9)
     each = vmap(observed)(*given)
     torch.testing.assert_close(each.sum(), observed(*given), rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("boundary", ["fixed", "periodic"])
+def test_second_derivatives_by_modes_are_those_by_chebyshev(boundary, moving):
+    masses, u, v = inputs()
+
+    def observed(method):
+        def of(masses):
+            state = tc.State(u[0], v[0] if moving else 0 * v[0])
+            return tc.evolve(tc.Chain(masses, boundary), state, [0.0, *TIMES], method).displacement.square().sum()
+
+        return of
+
+    wanted = torch.autograd.functional.hessian(observed("chebyshev"), masses[0])
+    for second in (jacrev(grad(observed("modes"))), lambda m: torch.autograd.functional.hessian(observed("modes"), m)):
+        torch.testing.assert_close(second(masses[0]), wanted, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("method", ["verlet", "symplectic4", "dopri5", "rk4"])
+def test_what_torch_func_cannot_trace_is_one_line(method):
+    given = inputs()
+    with pytest.raises(FieldError, match=f"method must be 'modes' or 'chebyshev' under torch.func .*, got {method}"):
+        grad(outcome(method, {}, "periodic"))(*given)
 
 
 def test_a_method_of_ones_own():

@@ -51,9 +51,13 @@ class Fields:
             for name in given:
                 if name not in names:
                     kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", cls.__name__).lower()
-                    article = "an" if kind[0] in "aeiou" else "a"
-                    raise FieldTypeError(f"{article} {kind} has no field {name!r}{suggestion(name, names)}")
+                    raise FieldTypeError(f"{with_article(kind)} has no field {name!r}{suggestion(name, names)}")
             return super().__new__(cls)
+
+
+def with_article(noun: str) -> str:
+    """``a Scene``, ``an Impulse``."""
+    return f"{'an' if noun[0].lower() in 'aeiou' else 'a'} {noun}"
 
 
 def shown(value: Any, width: int = 80) -> str:
@@ -129,7 +133,7 @@ def truth(field: str, value: Any) -> bool:
 def instance(field: str, value: Any, *kinds: type) -> None:
     """An error unless the value is of one of the kinds."""
     if not isinstance(value, kinds):
-        words = " or ".join("None" if kind is type(None) else f"a {kind.__name__}" for kind in kinds)
+        words = " or ".join("None" if kind is type(None) else with_article(kind.__name__) for kind in kinds)
         raise FieldTypeError(f"{field} must be {words}, got {shown(value)}")
 
 

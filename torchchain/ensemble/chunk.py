@@ -176,6 +176,8 @@ class Chunk:
         checks.instance(f"observable {entry.name}", values, Tensor)
         if tuple(values.shape) != shape:
             raise checks.fail(f"observable {entry.name}", f"give shape {shape}", f"shape {tuple(values.shape)}")
+        if values.is_complex():
+            raise checks.fail(f"observable {entry.name}", "give real numbers", values.dtype)
         return values
 
     def _some(self, low: int, high: int) -> Chunk:

@@ -83,7 +83,7 @@ def band_transfer(
     checks.truth("long_time", long_time)
     checks.truth("starts", starts)
     scene, stages = _transfer_scene(planning.resolved(scene)), stages or Stages()
-    if isinstance(method, str) and method == THEORY:
+    if checks.choice("method", method, ("auto", *scene.methods, THEORY)) == THEORY:
         checks.known_keys("options of method 'theory'", options or {}, ())
         with stages("theory"):
             return _from_theory(scene, long_time and scene.largest_damping == 0)

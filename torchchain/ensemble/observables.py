@@ -78,12 +78,18 @@ class Observable:
         checks.instance("observable.name", self.name, str)
         if not self.name.isidentifier() or self.name.endswith("_stderr"):
             raise checks.fail("observable.name", "be a name that does not end in _stderr", repr(self.name))
+        if self.name in (*AXES, "tone", "realization"):
+            raise checks.fail("observable.name", "be no axis of the results", repr(self.name))
+        for field in ("unit", "label"):
+            checks.instance(f"observable.{field}", getattr(self, field), str)
         for axis in self.axes:
             checks.choice("observable.axes", axis, AXES)
         if self.kernel is not None:
             checks.choice("observable.kernel", self.kernel, KERNELS)
         if (self.compute is None) == (self.average is None):
             raise checks.fail("observable", "have either compute or average", self.name)
+        if not callable(self.compute or self.average):
+            raise checks.FieldTypeError(f"observable must compute by a function, got {checks.shown(self.compute or self.average)}")
         if (self.compute is not None) != (self.axes[:1] == ("time",)):
             raise checks.fail("observable.axes", "start with 'time' for compute, and only then", self.axes)
 

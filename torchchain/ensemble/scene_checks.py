@@ -101,7 +101,7 @@ def check_records(scene: Scene) -> None:
     for name, kinds, example in _RECORDS:
         value = getattr(scene, name)
         if not isinstance(value, kinds) and not (value is None and name in ("stiffness_disorder", "si")):
-            words = " or ".join(f"{'an' if kind is Impulse else 'a'} {kind.__name__}" for kind in kinds)
+            words = " or ".join(checks.with_article(kind.__name__) for kind in kinds)
             raise checks.FieldTypeError(f"{name} must be {words}, e.g. {example}, got {checks.shown(value)}")
 
 

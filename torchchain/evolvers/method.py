@@ -39,6 +39,7 @@ class Method:
         candidate: whether the plan weighs it.
         single_precision: whether it keeps what it computes in float32, where the states are.
         compiled: whether it runs Numba kernels for tensors on the CPU that need no gradient.
+        traced: whether ``torch.func`` can trace it, as ``backward()`` can most.
         matrices: how many arrays of n_particles^2 numbers it holds per realization.
         decomposition: seconds per n_particles^2 and per n_particles^3 that a realization takes once, on one core of a 2023
             server, for a method with ``matrices``.
@@ -70,6 +71,7 @@ class Method:
     candidate: bool = False
     single_precision: bool = False
     compiled: bool = False
+    traced: bool = True
     matrices: int = 0
     decomposition: tuple[float, float] = (6.0e-8, 1.6e-10)
     most_unknowns: float = float("inf")

@@ -291,6 +291,7 @@ def _entry(solver: _Solver, start: Callable[..., Advance], options: dict[str, st
         cannot=loss if gradient else f"{loss}; gradients; other devices than the CPU, where it does its work",
         contacts=("linear", "hertz"),
         damped=True,
+        traced=False,
         options=options,
         candidate=solver.name == "dopri8",
         order_in_step=None if adaptive else solver.order,

@@ -40,6 +40,7 @@ METHOD = Method(
     candidate=True,
     single_precision=True,
     compiled=True,
+    traced=False,
     order_in_step=4,
     phase_error=6e-5,
     energy_error=3.4e-3,

@@ -30,6 +30,7 @@ METHOD = Method(
     candidate=True,
     single_precision=True,
     compiled=True,
+    traced=False,
     order_in_step=2,
     phase_error=1 / 24,
     energy_error=1 / 4,

@@ -40,6 +40,15 @@ def align_modes(chain: Chain, shapes: Tensor, field: Tensor) -> Tensor:
     return shapes.reshape(*chain.batch_shape, *[1] * (field.ndim - batch - 1), *shapes.shape[-2:])
 
 
+def _sinc(angle: Tensor) -> Tensor:
+    """sin(x) / x, whose derivatives at 0 torch has of the first order only."""
+    if not (angle.requires_grad or checks.is_transformed(angle)):
+        return torch.sinc(angle / math.pi)
+    rest = angle == 0
+    elsewhere = torch.sinc(torch.where(rest, 1.0, angle) / math.pi)
+    return torch.where(rest, 1 - angle.square() / 6, elsewhere)
+
+
 def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """From times to position and speed of every mode at each, (*batch, *any, time, mode) (Eq. 20).
 
@@ -63,7 +72,7 @@ def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Te
             speed = (-frequency * angle.sin()) * displacement
         if moves:
             # sin(w t) / w, which is t for the zero mode of a periodic chain (Eq. 21 divides by its w = 0)
-            position = position + (t * torch.sinc(angle / math.pi)) * velocity
+            position = position + (t * _sinc(angle)) * velocity
             speed = speed + cosine * velocity
         if not (displaced or moves):
             position = speed = position * angle  # at every time
