@@ -27,8 +27,7 @@ import torchchain as tc
 from torchchain import checks, plots
 from torchchain.ensemble.scene_file import regular_times
 from torchchain.evolvers import chebyshev, ode, symplectic
-from torchchain.evolvers.symplectic4 import PEFRL
-from torchchain.evolvers.verlet import VERLET
+from torchchain.evolvers.compositions import PEFRL, VERLET
 from torchchain.master import Calibration
 from torchchain.master.solving import ADAMS_ITERATIONS, ADAMS_STEPS, STABILITY
 
@@ -187,7 +186,7 @@ def _chebyshev_bound(seed: int) -> Edge:
 
     def error(value: float) -> float:
         frequency = torch.tensor(highest / math.sqrt(value), dtype=torch.float64)
-        found = chebyshev._plain(chain, state, frequency, 1e-15)(times).displacement[0]
+        found = chebyshev.expanded(chain, state, frequency, 1e-15, tc.Trajectory)(times).displacement[0]
         return float((found / 0.01 - exact * modes.shapes[:, -1]).abs().max())
 
     return Edge(

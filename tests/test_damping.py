@@ -9,8 +9,8 @@ import torch
 
 import torchchain as tc
 from torchchain.evolvers import METHODS, start, symplectic
+from torchchain.evolvers.compositions import VERLET
 from torchchain.evolvers.damped import NearDefectiveWarning, generator
-from torchchain.evolvers.verlet import VERLET
 
 DAMPED = [name for name, entry in METHODS.items() if entry.damped]
 ACCURATE = {"damped": {}, "verlet": {"step": 0.001}, "dopri8": {"rtol": 1e-9}}

@@ -14,8 +14,7 @@ from scipy.integrate import solve_ivp
 import torchchain as tc
 from torchchain.checks import FieldError
 from torchchain.evolvers import METHODS, ode, start, symplectic
-from torchchain.evolvers.symplectic4 import PEFRL
-from torchchain.evolvers.verlet import VERLET
+from torchchain.evolvers.compositions import PEFRL, VERLET
 
 TIMES = torch.tensor([0.0, 0.3, 1.0, 1.25, 4.0], dtype=torch.float64)
 EXACT = [name for name, entry in METHODS.items() if entry.order.startswith("exact")]

@@ -17,8 +17,8 @@ from torchchain.chain.amplitude import (
     warn_if_nonlinear,
 )
 from torchchain.evolvers import METHODS, energy_guard, symplectic
+from torchchain.evolvers.compositions import VERLET
 from torchchain.evolvers.energy_guard import EnergyDriftError
-from torchchain.evolvers.verlet import VERLET
 
 HERTZ = [name for name, entry in METHODS.items() if "hertz" in entry.contacts]
 SYMPLECTIC = ["verlet", "symplectic4"]

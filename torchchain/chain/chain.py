@@ -238,14 +238,13 @@ class Chain(checks.Fields):
         """
         stiffness = self.contact_stiffness
         x = torch.ones_like(self.masses)
-        ratio = x
-        for _ in range(sweeps + 1):
+        for _ in range(sweeps):
             image = self.of_both_contacts(stiffness * self.of_both_ends(x)) / self.masses
-            ratio = image / x
             # The geometric mean of x and its image stays positive and does not alternate between neighbors.
             x = (x * image).sqrt()
             x = x / x.amax(-1, keepdim=True)
             x = x.clamp(min=torch.finfo(x.dtype).tiny ** 0.25)
+        ratio = self.of_both_contacts(stiffness * self.of_both_ends(x)) / self.masses / x
         return ratio.amax(-1) * (1 + 8 * torch.finfo(x.dtype).eps)
 
 

@@ -8,11 +8,11 @@ from torchchain import checks
 from torchchain.chain import amplitude, scaling
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
-from torchchain.evolvers import chebyshev, damped, modes, ode, symplectic4, tridiagonal, verlet
+from torchchain.evolvers import chebyshev, compositions, damped, modes, ode, tridiagonal
 from torchchain.evolvers.method import METHODS, Advance, Method, chosen, register_method
 
 for _method in (
-    modes.METHOD, tridiagonal.METHOD, chebyshev.METHOD, verlet.METHOD, symplectic4.METHOD, damped.METHOD, *ode.METHODS
+    modes.METHOD, tridiagonal.METHOD, chebyshev.METHOD, *compositions.METHODS, damped.METHOD, *ode.METHODS
 ):  # fmt: skip
     register_method(_method)
 

@@ -60,9 +60,10 @@ def start(
     """
     tensors = (chain.masses, chain.contact_stiffness, state.displacement, state.velocity)
     tolerance, compiled = settled(accuracy, compiled, tensors)
+    frequency = highest_frequency(chain, bound)
     if compiled:
-        return CompiledAdvance(chain, state, bound, tolerance)
-    return _plain(chain, state, highest_frequency(chain, bound), tolerance)
+        return CompiledAdvance(chain, state, frequency, tolerance)
+    return expanded(chain, state, frequency, tolerance, Trajectory)
 
 
 def settled(accuracy: float, compiled: bool | None, tensors: Iterable[Tensor]) -> tuple[float, bool]:
@@ -92,13 +93,37 @@ def highest_frequency(chain: Chain, bound: float | Tensor | None = None) -> Tens
     Raises:
         FieldError: if a squared frequency exceeds the ``bound``.
     """
+    double = chain if chain.masses.dtype == torch.float64 else replace(chain, masses=chain.masses.double())
+
+    def exceeded(squared: Tensor) -> Tensor:
+        rule = f"be at most {WASTE:g} times chain.squared_frequency_bound(): work grows as its root"
+        checks.first_bad("bound", rule, squared, squared > WASTE * double.squared_frequency_bound(SWEEPS), "chain")
+        # A margin for rounding; no single high mode escapes a count of all of them.
+        return negative_pivots(double, (squared * (1 + 1e-12))[..., None])[..., 0] < chain.n_particles
+
+    return bounding_frequency(double, "chain", bound, exceeded)
+
+
+def bounding_frequency(
+    system: Any, kind: str, bound: float | Tensor | None, exceeded: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """:func:`highest_frequency` of chains or networks, the ``kind``, and of which squared frequencies are ``exceeded``."""
     with torch.no_grad():
-        squared = (
-            chain.squared_frequency_bound(SWEEPS).to(torch.float64) if bound is None else _checked_bound(chain, bound)
-        )
+        batch, device = system.batch_shape, system.masses.device
+        if bound is None:
+            squared = system.squared_frequency_bound(SWEEPS).to(torch.float64)
+        else:
+            given = checks.real_tensor("bound", bound).to(device, torch.float64)
+            checks.first_bad("bound", "be positive", given, given <= 0)
+            if given.shape not in (torch.Size(), batch):
+                raise checks.fail("bound", f"be a number or have shape {tuple(batch)}", f"shape {tuple(given.shape)}")
+            squared = given.expand(batch)
+            rule = f"not lie below the largest squared frequency ({kind}.squared_frequency_bound() never does)"
+            checks.first_bad("bound", rule, squared, exceeded(squared), kind)
         if checks.is_transformed(squared):  # one bound for all that vmap runs at once
-            squared = checks.traced_values(squared).amax().expand(chain.batch_shape)
-        return torch.as_tensor(rounded_up(_numbers(squared.sqrt())), device=squared.device)
+            squared = checks.traced_values(squared).amax().expand(batch)
+        squared = squared.clamp(min=1e-300)  # of a network without bonds: any W will do
+        return torch.as_tensor(rounded_up(_numbers(squared.sqrt())), device=device)
 
 
 def _numbers(values: Tensor) -> np.ndarray:
@@ -110,33 +135,6 @@ def rounded_up(frequency: np.ndarray) -> np.ndarray:
     """Rounded up to 24 bits: W^2 and most W t are exact then, and the operator and its time fit to the last bit."""
     mantissa, exponent = np.frexp(frequency)
     return np.ldexp(np.ceil(mantissa * 2**24) / 2**24, exponent)
-
-
-def _checked_bound(chain: Chain, bound: float | Tensor) -> Tensor:
-    """A user's bound of the squared frequency, (*batch,), float64; see :func:`highest_frequency`."""
-    squared = given_bound(bound, chain.masses)
-    double = replace(chain, masses=chain.masses.double())
-    checks.first_bad(
-        "bound",
-        "not lie below the largest squared frequency (chain.squared_frequency_bound() never does)",
-        squared,
-        # A margin for rounding; no single high mode escapes a count of all of them.
-        negative_pivots(double, (squared * (1 + 1e-12))[..., None])[..., 0] < chain.n_particles,
-        "chain",
-    )
-    own = WASTE * chain.squared_frequency_bound(SWEEPS).to(torch.float64)
-    rule = f"be at most {WASTE:g} times chain.squared_frequency_bound(): work grows as its root"
-    checks.first_bad("bound", rule, squared, squared > own, "chain")
-    return squared
-
-
-def given_bound(bound: float | Tensor, masses: Tensor) -> Tensor:
-    """A bound, one number or one for each of the ``masses`` (*batch, particle), as (*batch,), float64, positive."""
-    squared, batch = checks.real_tensor("bound", bound).to(masses.device, torch.float64), masses.shape[:-1]
-    checks.first_bad("bound", "be positive", squared, squared <= 0)
-    if squared.shape not in (torch.Size(), batch):
-        raise checks.fail("bound", f"be a number or have shape {tuple(batch)}", f"shape {tuple(squared.shape)}")
-    return squared.expand(batch)
 
 
 def check_work(times: Tensor, frequency: float) -> None:
@@ -151,31 +149,21 @@ def check_work(times: Tensor, frequency: float) -> None:
         )
 
 
-def _plain(chain: Chain, state: State, frequency: Tensor, tolerance: float) -> Advance:
-    """The expansion in plain torch, from each output time to the next."""
-    pair = torch.stack([state.displacement, state.velocity], dim=frequency.ndim)
-    weight = chain.align((4 / frequency.square()).to(chain.masses)[..., None] / chain.masses, pair)
-    return expanded(chain.force, pair, weight, frequency, tolerance, Trajectory, -2)
-
-
-def expanded(
-    force: Callable[[Tensor], Tensor], pair: Tensor, weight: Tensor, frequency: Tensor, tolerance: float,
-    trajectory: Callable[..., Any], time_axis: int,
-) -> Advance:  # fmt: skip
-    """The expansion for any linear force, in plain torch.
+def expanded(system: Any, state: State, frequency: Tensor, tolerance: float, trajectory: type[Trajectory]) -> Advance:
+    """The expansion in plain torch, from each output time to the next.
 
     Args:
-        force: of displacements like ``pair``.
-        pair: displacement and velocity, (*batch, 2, *state).
-        weight: 4 / (W^2 m), which broadcasts against a pair.
+        system: a chain or a network.
+        state: its start.
         frequency: W, (*batch,).
         tolerance: what truncation may leave out of a leap.
-        trajectory: makes the result from times, displacement and velocity.
-        time_axis: of these, counted from behind.
+        trajectory: what its states in time are.
     """
     from torchchain.evolvers.coefficients import coefficients_of  # imports Numba
 
     axis = frequency.ndim
+    pair = torch.stack([state.displacement, state.velocity], dim=axis)
+    weight = system.align((4 / frequency.square()).to(system.masses)[..., None] / system.masses, pair)
     ahead = (None,) * (pair.ndim - axis - 1)  # axes of a state behind the batch
     frequencies = _numbers(frequency.reshape(-1))
     now = 0.0
@@ -183,11 +171,11 @@ def expanded(
     def step(pair: Tensor, time: np.ndarray) -> Tensor:
         table = torch.from_numpy(coefficients_of(frequencies, time, tolerance)).to(pair)
         table = table.reshape(*table.shape[:2], *frequency.shape)[(..., *ahead)]
-        older, old = pair, pair + weight / 2 * force(pair)
+        older, old = pair, pair + weight / 2 * system.force(pair)
         total: list[Tensor] = []
         for k in range(table.shape[1]):
             if k > 1:
-                older, old = old, 2 * old - older + weight * force(old)
+                older, old = old, 2 * old - older + weight * system.force(old)
             displacement, velocity = (pair if k == 0 else old).unbind(axis)
             cosine, integral, derivative = table[:, k]
             terms = [cosine * displacement + integral * velocity, cosine * velocity + derivative * displacement]
@@ -206,7 +194,7 @@ def expanded(
                 pair = step(pair, np.where(leap < leaps, (t - now) / np.maximum(leaps, 1), 0.0))
             now = t
             outputs.append(pair)
-        displacement, velocity = torch.stack(outputs, dim=time_axis).unbind(axis)
+        displacement, velocity = torch.stack(outputs, dim=-1 - len(trajectory.axes_of_a_state)).unbind(axis)
         return trajectory(times, displacement, velocity)
 
     return advance
@@ -222,7 +210,7 @@ def later_times(times: Tensor, now: float) -> Tensor:
 class CompiledAdvance:
     """The expansion by the kernels of :mod:`stencil`, in float64 whatever the dtype of the state."""
 
-    def __init__(self, chain: Chain, state: State, bound: float | Tensor | None, tolerance: float) -> None:
+    def __init__(self, chain: Chain, state: State, frequency: Tensor, tolerance: float) -> None:
         from torchchain.evolvers import stencil  # imports Numba
 
         n = chain.n_particles
@@ -232,23 +220,14 @@ class CompiledAdvance:
 
         masses, springs = plain(chain.masses), plain(chain.in_a_row(chain.contact_stiffness))
         states = torch.stack([state.displacement.detach(), state.velocity.detach()], dim=-2)
-        periodic = chain.is_free
-        squared = np.empty(len(masses))
-        if bound is None:
-            side_by_side(
-                lambda begin, end: stencil.squared_bounds(begin, end, masses, springs, periodic, SWEEPS, squared),
-                len(masses),
-            )
-        else:
-            squared[:] = _checked_bound(chain, bound).reshape(-1).numpy()
         self.rows: Rows = stencil.Rows(
             masses=masses,
             contacts=springs,
             rigid_masses=plain(chain.rigid_mass[..., None])[:, 0],
-            frequencies=rounded_up(np.sqrt(squared)),
+            frequencies=frequency.reshape(-1).numpy(),
             states=states.double().reshape(-1, 2, n).numpy(),
             starts=math.prod(state.displacement.shape[:-1]) // len(masses),
-            periodic=periodic,
+            periodic=chain.is_free,
             tolerance=tolerance,
         )
         self._shape, self._n, self._dtype = state.displacement.shape[:-1], n, state.displacement.dtype

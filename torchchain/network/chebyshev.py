@@ -20,10 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchchain import checks
 from torchchain.chain import State
 from torchchain.evolvers.chebyshev import METHOD as CHAINS
-from torchchain.evolvers.chebyshev import check_work, expanded, given_bound, later_times, rounded_up, settled
+from torchchain.evolvers.chebyshev import bounding_frequency, check_work, expanded, later_times, settled
 from torchchain.evolvers.expansion import LEAP, LONGEST, SHARED_PHASE
 from torchchain.evolvers.method import Advance
 from torchchain.modes import phase
@@ -54,7 +53,7 @@ def start(
     frequency = highest_frequency(network, bound)
     if compiled:
         return CompiledAdvance(network, state, frequency, tolerance)
-    return _plain(network, state, frequency, tolerance)
+    return expanded(network, state, frequency, tolerance, NetworkTrajectory)
 
 
 def highest_frequency(network: Network, bound: float | Tensor | None = None) -> Tensor:
@@ -67,26 +66,14 @@ def highest_frequency(network: Network, bound: float | Tensor | None = None) -> 
     Raises:
         FieldError: if a squared frequency exceeds the ``bound``, which would make states grow without limit.
     """
-    with torch.no_grad():
-        if bound is None:
-            squared = network.squared_frequency_bound()
-        else:
-            squared = given_bound(bound, network.masses)
-            exceeded = torch.zeros(network.batch_shape, dtype=torch.bool, device=squared.device)
-            for member in np.ndindex(*network.batch_shape):
-                exceeded[member] = exceeds(network, float(squared[member]), member)
-            rule = "not lie below the largest squared frequency (network.squared_frequency_bound() never does)"
-            checks.first_bad("bound", rule, squared, exceeded, "network")
-        frequency = squared.clamp(min=1e-300).sqrt().cpu().numpy()  # no bonds: any W will do
-        return torch.as_tensor(rounded_up(frequency), device=squared.device)
 
+    def exceeded(squared: Tensor) -> Tensor:
+        found = torch.zeros(network.batch_shape, dtype=torch.bool, device=squared.device)
+        for member in np.ndindex(*network.batch_shape):
+            found[member] = exceeds(network, float(squared[member]), member)
+        return found
 
-def _plain(network: Network, state: State, frequency: Tensor, tolerance: float) -> Advance:
-    """The expansion in plain torch, from each output time to the next."""
-    pair = torch.stack([state.displacement, state.velocity], dim=frequency.ndim)
-    weight = 1 / network.align(network.masses, pair)
-    weight = weight * network.align((4 / frequency.square()).to(network.masses)[..., None], pair)
-    return expanded(network.force, pair, weight, frequency, tolerance, NetworkTrajectory, -3)
+    return bounding_frequency(network, "network", bound, exceeded)
 
 
 class CompiledAdvance:
