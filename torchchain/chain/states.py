@@ -93,7 +93,8 @@ class Trajectory:
     @property
     def final(self) -> State:
         """The state at the last time."""
-        return State(self.displacement[..., -1, :], self.velocity[..., -1, :])
+        time = -1 - len(self.axes_of_a_state)
+        return State(self.displacement.select(time, -1), self.velocity.select(time, -1))
 
 
 def join(parts: list[Trajectory]) -> Trajectory:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import Tensor
 
 from torchchain.chain.chain import Chain
@@ -14,11 +16,17 @@ from torchchain.modes.spectrum import NormalModes, modes_of, normal_modes
 def start(chain: Chain, state: State, modes: NormalModes | None = None) -> Advance:
     """See the registry entry below."""
     modes = normal_modes(chain) if modes is None else modes_of(chain, modes)
-    motion, back = modal_motion(chain, state, modes), modes.shapes.mT
+    return superposed(chain, state, modes, Trajectory)
+
+
+def superposed(system: Any, state: State, modes: Any, trajectory: type[Trajectory]) -> Advance:
+    """The evolution of a chain or a network by its modes; its states in time are a kind of trajectory."""
+    motion, batch = modal_motion(system, state, modes), len(system.batch_shape)
+    back, unknowns = modes.shapes.flatten(batch, -2).mT, modes.shapes.shape[batch:-1]
 
     def advance(times: Tensor) -> Trajectory:
-        position, speed = motion(times)
-        return Trajectory(times, change_basis(position, back), change_basis(speed, back))
+        position, speed = (change_basis(z, back).unflatten(-1, unknowns) for z in motion(times))
+        return trajectory(times, position, speed)
 
     return advance
 

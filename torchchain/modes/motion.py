@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,16 +13,20 @@ from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State
 from torchchain.modes import phase
-from torchchain.modes.spectrum import NormalModes
 
 
-def modal_amplitudes(chain: Chain, state: State, modes: NormalModes) -> tuple[Tensor, Tensor]:
-    """Displacement and velocity in the basis of the modes, each (*batch, *any, mode); S^-1 = S^T M (Eq. 18)."""
-    masses = chain.align(chain.masses, state.displacement)
-    return (
-        change_basis(masses * state.displacement, modes.shapes),
-        change_basis(masses * state.velocity, modes.shapes),
-    )
+def modal_amplitudes(system: Any, state: State, modes: Any) -> tuple[Tensor, Tensor]:
+    """Displacement and velocity in the basis of the modes, each (*batch, *any, mode); S^-1 = S^T M (Eq. 18).
+
+    Args:
+        system: a chain, or a network.
+        state: of it.
+        modes: of it, with shapes (*batch, particle, mode), or (*batch, particle, component, mode) of a network.
+    """
+    batch, masses = len(system.batch_shape), system.align(system.masses, state.displacement)
+    basis, first = modes.shapes.flatten(batch, -2), batch + 1 - modes.shapes.ndim
+    displacement, velocity = ((masses * x).flatten(first) for x in (state.displacement, state.velocity))
+    return change_basis(displacement, basis), change_basis(velocity, basis)
 
 
 def change_basis(field: Tensor, basis: Tensor) -> Tensor:
@@ -49,13 +54,16 @@ def _sinc(angle: Tensor) -> Tensor:
     return torch.where(rest, 1 - angle.square() / 6, elsewhere)
 
 
-def modal_motion(chain: Chain, state: State, modes: NormalModes) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+def modal_motion(system: Any, state: State, modes: Any) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """From times to position and speed of every mode at each, (*batch, *any, time, mode) (Eq. 20).
+
+    Takes what :func:`modal_amplitudes` does.
 
     Times at which rounding has blurred the phases warn, and far beyond raise; see :func:`phase.check`.
     """
-    displacement, velocity = (z[..., None, :] for z in modal_amplitudes(chain, state, modes))
-    frequency = chain.align(modes.frequencies, state.displacement)[..., None, :]
+    displacement, velocity = (z[..., None, :] for z in modal_amplitudes(system, state, modes))
+    batch = system.batch_shape
+    frequency = modes.frequencies.reshape(*batch, *[1] * (displacement.ndim - len(batch) - 1), displacement.shape[-1])
     displaced, moves = (
         field.requires_grad or checks.is_transformed(field) or checks.first(field != 0) is not None
         for field in (state.displacement, state.velocity)

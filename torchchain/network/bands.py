@@ -14,8 +14,8 @@ from torchchain import checks
 from torchchain.chain import State
 from torchchain.chain.states import Trajectory
 from torchchain.energy.space import positive
+from torchchain.modes.motion import modal_amplitudes
 from torchchain.network.lattices import Lattice, uniform_stiffness
-from torchchain.network.modal import amplitudes
 from torchchain.network.modes import NetworkModes, normal_modes
 from torchchain.network.plane_waves import plane_wave
 from torchchain.network.trajectories import check_trajectory
@@ -312,7 +312,7 @@ def long_time_band_energy(
     weights = _weights(network, n_bands)
     network.check_state(state.displacement)
     modes = normal_modes(network) if modes is None else modes
-    coordinate, speed = amplitudes(network, state, modes)
+    coordinate, speed = modal_amplitudes(network, state, modes)
     batch = len(network.batch_shape)
     w = modes.frequencies.reshape(-1, modes.frequencies.shape[-1])
     shapes = modes.shapes.reshape(len(w), *modes.shapes.shape[batch:])

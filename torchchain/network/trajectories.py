@@ -8,7 +8,6 @@ from typing import ClassVar
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.chain import State
 from torchchain.chain.states import Trajectory
 from torchchain.network.networks import Network
 
@@ -30,11 +29,6 @@ class NetworkTrajectory(Trajectory):
     """
 
     axes_of_a_state: ClassVar[tuple[str, ...]] = ("particle", "component")
-
-    @property
-    def final(self) -> State:
-        """The state at the last time."""
-        return State(self.displacement[..., -1, :, :], self.velocity[..., -1, :, :])
 
 
 def check_trajectory(network: Network, trajectory: Trajectory) -> tuple[Tensor, Tensor]:
