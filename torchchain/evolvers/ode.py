@@ -81,19 +81,23 @@ class _Motion:
 
 
 @dataclass(frozen=True)
-class _Solver:
-    """What an integrator is called and told here; rtol is a power of eps, the limits are those of w_max and d_max step."""
+class _Solver(Integrator):
+    """An integrator as it is called and told here; rtol is a power of eps."""
 
-    name: str
-    integrator: Integrator
-    summary: str
+    method: str = ""  # torchdiffeq's name for it
     stability: str = "by its error estimate"
     rtol: float = 0.5
     options: dict[str, Any] = field(default_factory=dict)
-    order: int | None = None
-    evaluations: str = ""
-    limit: float | None = None
-    damping_limit: float | None = None
+
+    @property
+    def limit(self) -> float | None:
+        """Of w_max step."""
+        return self.swing_limit or None
+
+    @property
+    def damping_limit(self) -> float | None:
+        """Of d_max step."""
+        return self.decay_limit if self.swing_limit else None
 
 
 def _evolve(
@@ -171,7 +175,7 @@ def _start_adaptive(
                 grid,
                 rtol=rtol,
                 atol=absolute.cpu().flatten().numpy() if motion.note_calls else absolute,
-                method=solver.integrator.name,
+                method=solver.method,
                 options=options,
             )
         except AssertionError as error:
@@ -224,7 +228,7 @@ def _start_fixed(solver: _Solver, chain: Chain, state: State, step: float | None
                 t,
                 rtol=1e3,  # a corrector that does not iterate meets any
                 atol=1e3,
-                method=solver.integrator.name,
+                method=solver.method,
                 options={**solver.options, "grid_constructor": lambda *_, grid=grid: grid},
             )
             series += found[1:]
@@ -239,17 +243,9 @@ NO_STEP = (
 )
 
 
-def _solver(method: str, name: str = "", **told: Any) -> _Solver:
-    """An integrator as it is used here: its own facts, but for those that are told."""
-    known = INTEGRATORS[method]
-    facts: dict[str, Any] = {
-        "summary": known.summary,
-        "order": known.order,
-        "evaluations": str(known.evaluations),
-        "limit": known.swing_limit or None,
-        "damping_limit": known.decay_limit if known.swing_limit else None,
-    }
-    return _Solver(name or method, known, **{**facts, **told})
+def _solver(method: str, **told: Any) -> _Solver:
+    """An integrator with its own facts, but for those that are told."""
+    return _Solver(**{**vars(INTEGRATORS[method]), "method": method, **told})
 
 
 ADAPTIVE = (
@@ -258,7 +254,7 @@ ADAPTIVE = (
     _solver("bosh3", rtol=0.4),
     _solver("adaptive_heun", rtol=0.3),
     _solver("fehlberg2", rtol=0.4),
-    _solver("scipy_solver", "lsoda", summary="LSODA, Adams of variable order", evaluations="about 2"),
+    _solver("scipy_solver", name="lsoda", summary="LSODA, Adams of variable order", evaluations=2),
 )
 ADAMS = {"max_order": 5}  # the number of slopes that torchdiffeq keeps, one more than it uses
 FIXED = (
@@ -272,13 +268,13 @@ FIXED = (
         "implicit_adams",
         summary="Adams, Bashforth and Moulton with four past steps, corrected once",
         stability=NO_STEP.format(growth="0.1 (w step)^6") + ", and w_max step must be less than 1",
-        options=ADAMS, order=5, evaluations="2", limit=1.0, damping_limit=1.41,
+        options=ADAMS, order=5, evaluations=2, swing_limit=1.0, decay_limit=1.41,
     ),
 )  # fmt: skip
 
 
 def _entry(solver: _Solver, start: Callable[..., Advance], options: dict[str, str]) -> Method:
-    adaptive, gradient = solver.integrator.adaptive, solver.name != "lsoda"
+    adaptive, gradient = solver.adaptive, solver.name != "lsoda"
     loss = "keep energy: it changes steadily, and by more than a tenth is an error"
     return Method(
         name=solver.name,
@@ -287,7 +283,7 @@ def _entry(solver: _Solver, start: Callable[..., Advance], options: dict[str, st
         order=f"{solver.order}" if solver.order else "variable, up to 12",
         conserves="momentum",
         stability=solver.stability + ("" if adaptive else "; the energy is watched"),
-        cost=f"{solver.evaluations} forces per step, N each",
+        cost=f"{'' if gradient else 'about '}{solver.evaluations} forces per step, N each",
         cannot=loss if gradient else f"{loss}; gradients; other devices than the CPU, where it does its work",
         contacts=("linear", "hertz"),
         damped=True,
@@ -295,7 +291,7 @@ def _entry(solver: _Solver, start: Callable[..., Advance], options: dict[str, st
         options=options,
         candidate=solver.name == "dopri8",
         order_in_step=None if adaptive else solver.order,
-        forces_per_step=int(solver.evaluations[-1:] if solver.name == "lsoda" else solver.evaluations),
+        forces_per_step=solver.evaluations or 1,
         stability_limit=solver.limit,
     )
 
