@@ -25,7 +25,7 @@ PEFRL = Composition(
 METHODS = (
     Method(
         name="verlet",
-        start=partial(start, composition=VERLET, method="verlet"),
+        start=partial(start, VERLET, "verlet"),
         summary="velocity Verlet (Swope et al. 1982); damping by the explicit midpoint rule for half a step before and after",
         order="2; the phase error of a mode grows as w^3 step^2 t / 24",
         conserves="a nearby energy exactly, so that the energy of linear chains only swings, by (w step)^2 / 4; momentum; "
@@ -49,7 +49,7 @@ METHODS = (
     ),
     Method(
         name="symplectic4",
-        start=partial(start, composition=PEFRL, method="symplectic4"),
+        start=partial(start, PEFRL, "symplectic4"),
         summary="the position extended Forest-Ruth-like composition (Omelyan, Mryglod and Folk 2002), four forces per step",
         order="4; the phase error of a mode grows as 6e-5 w^5 step^4 t",
         conserves="a nearby energy exactly, so that the energy of linear chains only swings; momentum",

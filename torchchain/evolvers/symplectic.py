@@ -144,9 +144,7 @@ def substeps(now: float, times: list[float], step: Tensor | float) -> np.ndarray
     return np.ceil(ratio * (1 - 1e-9)).astype(np.int64)
 
 
-def start(
-    chain: Chain, state: State, step: float | None = None, *, composition: Composition, method: str
-) -> Advance:
+def start(composition: Composition, method: str, chain: Chain, state: State, step: float | None = None) -> Advance:
     """The evolution by a composition, its step checked."""
     steps = checked_step(chain, state, composition, method, step)
     advance = stepping(chain, state, composition, steps)

@@ -15,7 +15,7 @@ from torchchain import checks
 from torchchain.frames.passes import Passed, frames_at, scanned, where
 from torchchain.frames.record import Box
 from torchchain.frames.registry import Entry, Format, Raw, Scan
-from torchchain.frames.text import CutShort, Text, parse
+from torchchain.frames.text import CutShort, Text, number_of, parse
 
 # A header of N, time and the corners of the domain: 2 + 4 numbers in two dimensions, 2 + 6 in three. A row is position,
 # velocity, radius, angle, angular velocity and one number of the user's (the species unless changed).
@@ -46,11 +46,8 @@ def _header(text: Text, number: int) -> tuple[int, float, list[float]] | None:
     if line is None:
         return None
     here, words = where(text.name, number), line.split()
-    try:
-        numbers = [float(word) for word in words if "_" not in word]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (6, 8) or len(words) != len(numbers) or not np.isfinite(numbers).all():
+    numbers = [value for value in map(number_of, words) if value is not None]
+    if len(numbers) not in (6, 8) or len(words) != len(numbers):
         raise checks.fail(
             f"{here}: header",
             "be N, time and the corners of the domain (6 or 8 finite numbers)",
@@ -151,22 +148,15 @@ def _particle(here: str, words: list[str], found: dict[str, list[float]]) -> Non
         if key not in words[:-1]:
             raise checks.fail(here, f"state its {key}", checks.shown(" ".join(words), 50))
         word = words[words.index(key) + 1]
-        try:
-            value = float(word)
-            good = 0 <= value < 2**63 and (name != "id" or value == int(value))
-        except ValueError:
-            good = False
-        if not good:
+        value = number_of(word)
+        if value is None or not 0 <= value < 2**63 or (name == "id" and value % 1):
             raise checks.fail(f"{here}: {key}", "be a number, not negative", checks.shown(word, 40))
         found[name].append(value if name != "mass" else (1 / value if value else np.inf))
 
 
 def _recognizes(head: bytes) -> bool:
-    words = head.partition(b"\n")[0].split()
-    try:
-        return len(words) in (6, 8) and all(np.isfinite(float(word)) for word in words)
-    except ValueError:
-        return False
+    words = head.partition(b"\n")[0].decode("latin-1").split()
+    return len(words) in (6, 8) and all(number_of(word) is not None for word in words)
 
 
 FORMAT = Format(

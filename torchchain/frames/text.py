@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import gzip
 import io
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -19,9 +18,6 @@ from torchchain import checks
 
 CHUNK = 1 << 22
 LONGEST_LINE = 1 << 16
-SMALL = 1 << 16
-"""Bytes of rows below which they are split here, not by the parser."""
-BLANKS = np.frombuffer(b" \t\n\r\x0b\x0c", dtype=np.uint8)
 T = TypeVar("T")
 GZIP_RATIO = 1032  # deflate cannot make more bytes than this of one
 
@@ -220,16 +216,19 @@ class Text:
         return done
 
 
-def as_number(field: str, word: str, whole: bool = False) -> float:
-    """A word of a file as a finite number."""
+def number_of(word: str, whole: bool = False) -> float | None:
+    """The finite number that a word of a file is, None if it is none."""
     try:
-        if "_" in word:
-            raise ValueError
         value = int(word) if whole else float(word)
-        good = abs(value) < 2**63 and np.isfinite(float(value))
     except ValueError:
-        good = False
-    if not good:
+        return None
+    return value if "_" not in word and (abs(value) < 2**63 if whole else np.isfinite(value)) else None
+
+
+def as_number(field: str, word: str, whole: bool = False) -> float:
+    """The same, below 2^63; an error for what is none."""
+    value = number_of(word, whole)
+    if value is None or abs(value) >= 2**63:
         raise checks.fail(field, f"be a {'whole' if whole else 'finite'} number", checks.shown(word, 40))
     return value
 
@@ -249,62 +248,24 @@ def parse(
     Raises:
         FieldError: for a row with more or fewer columns, or a value that is no finite number, naming row and column.
     """
-    import pandas
-
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in columns if name in wanted}
-    kinds = {i: np.int64 if name in integers else np.float64 for i, name in enumerate(columns) if name in wanted}
-    last, done = len(columns) - 1, 0
+    kinds = {name: np.int64 if name in integers else np.float64 for name in columns if name in wanted}
+    # Words that nobody wants take a byte each: rows must hold as many words as there are columns.
+    row = np.dtype([(name, kinds.get(name, "S1")) for name in columns])
+    parts, done = [np.empty(0, row)], 0
     for block in blocks:
         rows = block.count(b"\n")
-        plain = _plain(block, rows, last + 1, kinds) if len(block) < SMALL else None
-        if plain is not None:
-            for i, values in plain.items():
-                parts[columns[i]].append(values)
-            done += rows
-            continue
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter(
-                    "error", pandas.errors.ParserWarning
-                )  # all that it says of rows that are too long
-                table = pandas.read_csv(
-                    io.BytesIO(block), sep=r"\s+", header=None, names=range(last + 1), dtype=kinds, na_filter=False,
-                    quoting=csv.QUOTE_NONE, index_col=False, encoding="latin-1", skip_blank_lines=False, low_memory=False,
-                )  # fmt: skip
-            # A row that is too short ends in an empty word.
-            good = len(table) == rows and (
-                last in kinds or table[last].dtype.kind in "iuf" or not (table[last] == "").any()
-            )
-            good = good and all(np.isfinite(table[i].to_numpy()).all() for i in kinds)
-        except (ValueError, OverflowError, pandas.errors.ParserWarning):
+                warnings.simplefilter("error")  # of blocks without words, or an integer that is written like 1.0
+                table = np.loadtxt(io.BytesIO(block), row, comments=None, ndmin=1, encoding="latin-1")
+            good = len(table) == rows and all(np.isfinite(table[name]).all() for name in kinds)
+        except (ValueError, UserWarning, DeprecationWarning):
             good = False
         if not good:
             raise _first_bad(where, block, columns, integers, wanted, done)
-        for i in kinds:
-            parts[columns[i]].append(table[i].to_numpy(copy=True))
+        parts.append(table)
         done += rows
-    for i, kind in kinds.items():
-        if not parts[columns[i]]:
-            parts[columns[i]].append(np.empty(0, dtype=kind))
-    return {name: part[0] if len(part) == 1 else np.concatenate(part) for name, part in parts.items()}
-
-
-def _plain(block: bytes, rows: int, width: int, kinds: Mapping[int, type]) -> dict[int, np.ndarray] | None:
-    """The wanted columns of a few good rows, for which starting a parser takes longer than parsing; None for others."""
-    words = block.split()
-    # Where a word begins and a line ends: as many words in every line.
-    text = np.frombuffer(block, dtype=np.uint8)
-    blank = np.isin(text, BLANKS)
-    begins = np.flatnonzero(~blank & np.concatenate(([True], blank[:-1])))
-    counts = np.diff(np.searchsorted(begins, np.flatnonzero(text == 10)), prepend=0)
-    if len(words) != rows * width or len(begins) != len(words) or (counts != width).any() or b"_" in block:
-        return None
-    table = np.array(words).reshape(rows, width)
-    try:
-        found: dict[int, np.ndarray] = {i: table[:, i].astype(kind) for i, kind in kinds.items()}
-    except (ValueError, OverflowError):
-        return None
-    return found if all(np.isfinite(values).all() for values in found.values()) else None
+    return {name: np.concatenate([part[name] for part in parts]) for name in kinds}
 
 
 def _first_bad(
@@ -320,14 +281,7 @@ def _first_bad(
                 f"{len(words)}: {checks.shown(row, 50)}",
             )
         for name, word in zip(columns, words, strict=True):
-            if name not in wanted:
-                continue
-            try:
-                value = int(word) if name in integers else float(word)
-                good = "_" not in word and (abs(value) < 2**63 if name in integers else np.isfinite(value))
-            except ValueError:
-                good = False
-            if not good:
+            if name in wanted and number_of(word, name in integers) is None:
                 kind = "a whole number" if name in integers else "a finite number"
                 return checks.fail(f"{where}: {name}", f"be {kind}", f"{checks.shown(word, 40)} in row {done + i + 1}")
     return checks.fail(f"{where}: rows", "be numbers with blanks between", checks.shown(block[:40].decode("latin-1")))
