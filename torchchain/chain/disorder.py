@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,21 +96,14 @@ class Disorder(checks.Fields):
     ) -> Tensor:
         checks.truth("opposite_pairs", opposite_pairs)
         seed = checks.integer("seed", seed, 0, 2**64 - 1)
-        if checks.is_collection(realizations):
-            numbers = [checks.integer("realizations", i, 0, 2**63) for i in realizations]
-        else:
-            realizations = checks.integer("realizations", realizations, 1, 10**9)
-            _require_room(size, realizations)
-            numbers = list(range(realizations))
+        numbers = numbers_of(realizations)
         _require_room(size, len(numbers))
-        uniform = np.empty((len(numbers), size))
+        found = np.empty((len(numbers), size))
         for row, i in enumerate(numbers):
-            draw = i // 2 if opposite_pairs else i
-            bits = np.random.Philox(key=np.array([seed, draw], dtype=np.uint64), counter=[0, 0, 0, stream])
-            uniform[row] = (bits.random_raw(size) >> np.uint64(11)) + 0.5  # the middle of 2**53 equal cells
+            found[row] = uniform(size, i // 2 if opposite_pairs else i, seed, stream)
             if opposite_pairs and i % 2:
-                uniform[row] = np.maximum(2.0**53 - uniform[row], 0.5)
-        return torch.from_numpy(self._quantile(uniform * 2.0**-53))
+                found[row] = np.maximum(1 - found[row], 2.0**-54)
+        return torch.from_numpy(self._quantile(found))
 
     def _quantile(self, uniform: np.ndarray) -> np.ndarray:
         """Inverse of the distribution function of the values at or above ``lower``."""
@@ -147,6 +140,19 @@ class Disorder(checks.Fields):
             sigma = np.sqrt(np.log1p(xi**2))
             return special.ndtr((np.log(value) + sigma**2 / 2) / sigma)
         return special.gammainc(xi**-2, value / xi**2)
+
+
+def numbers_of(realizations: int | Iterable[int]) -> Sequence[int]:
+    """Realization numbers, counted from 0, where either they or how many they are is given."""
+    if checks.is_collection(realizations):
+        return [checks.integer("realizations", i, 0, 2**63) for i in realizations]
+    return range(checks.integer("realizations", realizations, 1, 10**9))
+
+
+def uniform(size: int, realization: int, seed: int, stream: int) -> np.ndarray:
+    """Numbers in (0, 1), (size,), from the counter-based generator Philox with key (seed, realization)."""
+    bits = np.random.Philox(key=np.array([seed, realization], dtype=np.uint64), counter=[0, 0, 0, stream])
+    return ((bits.random_raw(size) >> np.uint64(11)) + 0.5) * 2.0**-53  # the middle of 2**53 equal cells
 
 
 def _require_room(size: int, realizations: int) -> None:

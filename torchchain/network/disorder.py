@@ -13,22 +13,11 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import Disorder
+from torchchain.chain.disorder import numbers_of, uniform
 from torchchain.network.networks import Network
 
 AnyNetwork = TypeVar("AnyNetwork", bound=Network)
 _BONDS, _POSITIONS, _KINDS = 2, 3, 4  # random streams of a realization, besides those of masses and stiffnesses
-
-
-def uniform(size: int, realization: int, seed: int, stream: int) -> np.ndarray:
-    """Numbers in (0, 1), (size,), from the counter-based generator Philox with key (seed, realization)."""
-    bits = np.random.Philox(key=np.array([seed, realization], dtype=np.uint64), counter=[0, 0, 0, stream])
-    return ((bits.random_raw(size) >> np.uint64(11)) + 0.5) * 2.0**-53
-
-
-def _numbers(realizations: int | Iterable[int]) -> list[int]:
-    if checks.is_collection(realizations):
-        return [checks.integer("realizations", i, 0, 2**63) for i in realizations]
-    return list(range(checks.integer("realizations", realizations, 1, 10**9)))
 
 
 def disordered(
@@ -55,7 +44,7 @@ def disordered(
         The same kind of network with masses (realization, particle) and stiffness (realization, bond).
     """
     _one(network)
-    numbers = _numbers(realizations)
+    numbers = numbers_of(realizations)
     changes: dict[str, Any] = {"masses": network.masses.expand(len(numbers), -1)}
     if masses is not None:
         checks.instance("masses", masses, Disorder)
@@ -82,7 +71,7 @@ def diluted(network: Network, fraction: float, realizations: int | Iterable[int]
     """
     _one(network)
     fraction = checks.number("fraction", fraction, at_least=0, at_most=1)
-    numbers = _numbers(realizations)
+    numbers = numbers_of(realizations)
     one_each = replace(network, masses=network.masses.expand(len(numbers), -1))
     return without_bonds(one_each, kept_bonds(network.n_bonds, fraction, numbers, seed))
 
@@ -155,7 +144,7 @@ def mixture(
     ends = np.round(np.cumsum(parts) * n_particles).astype(int)
     ends[-1] = n_particles
     ordered = np.repeat(kinds, np.diff(np.concatenate([[0], ends])))
-    rows = [ordered[np.argsort(uniform(n_particles, i, seed, _KINDS), kind="stable")] for i in _numbers(realizations)]
+    rows = [ordered[np.argsort(uniform(n_particles, i, seed, _KINDS), kind="stable")] for i in numbers_of(realizations)]
     return torch.from_numpy(np.stack(rows))
 
 

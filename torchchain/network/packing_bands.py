@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import State
+from torchchain.chain.disorder import uniform
 from torchchain.chain.states import Trajectory
 from torchchain.energy.space import positive
-from torchchain.network.disorder import uniform
 from torchchain.network.networks import Network
 from torchchain.network.wavenumber import POLARIZATIONS, box_wavevectors, plane_wave_energy, plane_waves, shell_energy
 

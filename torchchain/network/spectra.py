@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.chain.disorder import uniform
 from torchchain.network.chebyshev import highest_frequency
-from torchchain.network.disorder import uniform
 from torchchain.network.lattices import Lattice, dynamical_matrix, reciprocal
 from torchchain.network.layouts import layout_of
 from torchchain.network.modes import check_stability

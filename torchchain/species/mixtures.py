@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.chain import Chain
-from torchchain.chain.disorder import Disorder
+from torchchain.chain.disorder import Disorder, numbers_of, uniform
 
 ARRANGEMENTS = ("random", "alternating", "blocks")
 _SPECIES = 3  # a random stream of a realization beside those of masses, stiffnesses and phases
@@ -229,17 +229,11 @@ class Mixture:
         """
         n = checks.integer("n_particles", n_particles, 2)
         seed = checks.integer("seed", seed, 0, 2**64 - 1)
-        if checks.is_collection(realizations):
-            numbers = [checks.integer("realizations", i, 0, 2**63) for i in realizations]
-        else:
-            numbers = list(range(checks.integer("realizations", realizations, 1, 10**7)))
+        numbers = numbers_of(realizations)
         edges = np.cumsum([entry.fraction for entry in self.species])[:-1]
         if self.arrangement == "random":
-            draws = [
-                np.random.Philox(key=np.array([seed, i], dtype=np.uint64), counter=[0, 0, 0, _SPECIES]) for i in numbers
-            ]
-            uniform = np.stack([(draw.random_raw(n) >> np.uint64(11)) * 2.0**-53 for draw in draws])
-            return torch.from_numpy(np.searchsorted(edges, uniform, side="right"))
+            draws = np.stack([uniform(n, i, seed, _SPECIES) for i in numbers])
+            return torch.from_numpy(np.searchsorted(edges, draws, side="right"))
         places = np.arange(n)
         row = places % len(self.species)
         if self.arrangement == "blocks":
