@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from typing import Generic, TypeVar, overload
 
 import torch
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 Owner = TypeVar("Owner")
 Item = TypeVar("Item")
@@ -62,9 +63,15 @@ def single_thread() -> Iterator[int]:
 
 @contextmanager
 def single_blas_thread() -> Iterator[int]:
-    """:func:`single_thread` for NumPy and SciPy too; finding their libraries takes some milliseconds."""
-    with single_thread() as before, threadpool_limits(1, user_api="blas"):
+    """:func:`single_thread` for NumPy and SciPy too."""
+    with single_thread() as before, _libraries("scipy.linalg" in sys.modules).limit(limits=1, user_api="blas"):
         yield before
+
+
+@cache
+def _libraries(scipy: bool) -> ThreadpoolController:
+    """The libraries that are loaded, with or without SciPy's own; finding them takes some milliseconds."""
+    return ThreadpoolController()
 
 
 @contextmanager

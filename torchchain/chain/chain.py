@@ -143,7 +143,7 @@ class Chain(checks.Fields):
 
     def net(self, tension: Tensor) -> Tensor:
         """Force on every particle, (*batch, *any, particle): tension of its right contact minus that of its left."""
-        return tension.roll(-1, -1) - tension if self.is_free else tension.diff(dim=-1)
+        return tension.roll(-1, -1).sub_(tension) if self.is_free else tension.diff(dim=-1)
 
     def of_both_ends(self, field: Tensor) -> Tensor:
         """A quantity of the particles summed over both ends of every contact, (*batch, *any, contact); walls have none."""
@@ -160,13 +160,13 @@ class Chain(checks.Fields):
         """A quantity of the contacts on the left of particle 1, 2, ..., N and on the right of N, (*batch, N + 1)."""
         return torch.cat([field, field[..., :1]], dim=-1) if self.is_free else field
 
-    def without_rigid_motion(self, displacement: Tensor) -> Tensor:
-        """The displacement counted from where the chain has moved as a whole, the mean by mass; between walls as it is."""
+    def without_rigid_motion(self, displacement: Tensor, factor: float = 1.0) -> Tensor:
+        """The displacement counted from where the chain has moved as a whole, the mean by mass, times a factor; between walls as it is."""
         mass = self.rigid_mass
         if not checks.is_transformed(mass) and bool(mass.isinf().all()):
-            return displacement
+            return displacement * factor
         moment = (self.align(self.masses, displacement) * displacement).sum(-1, keepdim=True)
-        return displacement - moment / self.align(mass[..., None], displacement)
+        return torch.add(moment / self.align(mass[..., None] / -factor, displacement), displacement, alpha=factor)
 
     def tension(self, elongation: Tensor) -> Tensor:
         """Pull of every contact relative to the precompressed state, (*batch, *any, contact)."""

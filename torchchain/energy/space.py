@@ -66,7 +66,7 @@ def potential_energy(chain: Chain, trajectory: Trajectory, definition: str = "si
     displacement = trajectory.displacement
     if definition == "site":
         require_linear(chain, "definition 'bond'")
-        energy = chain.force(displacement) * chain.without_rigid_motion(displacement) / -2
+        energy = chain.force(displacement) * chain.without_rigid_motion(displacement, -0.5)
         return checks.finite("energy of trajectory", energy, "particle")
     contact = checks.finite("energy of trajectory", chain.contact_energy(displacement), "contact")
     ends = chain.of_both_ends(torch.ones_like(displacement[..., 0, :]))[..., None, :]  # a wall's contact has one

@@ -17,6 +17,7 @@ TOGETHER = {"cpu": 2**25, "cuda": 2**30}
 DECOMPOSED = {"cpu": 2**22, "cuda": 2**30}  # and of the matrices of a long-time average
 GROUPS = 16  # at least so many, for the threads to share
 CHUNK_WORK = 2**26  # particles times rows times times of a chunk of the stencil: about a second
+SMALL_WORK = 2**22  # and no less than this, where there are chains enough for every worker
 PARTS = 5  # chunks of a worker, for the progress bar, and that what goes on beside them may begin early
 BLOCKS = 20
 
@@ -40,7 +41,7 @@ class Layout:
         window, group: times and realizations whose states go through matrix products together: they decide how
             products round.
         held: bytes of a realization under way.
-        largest: realizations of a chunk at most.
+        largest, least: realizations of a chunk at most, and what is not worth cutting.
     """
 
     device: torch.device
@@ -50,6 +51,7 @@ class Layout:
     group: int
     held: int
     largest: int
+    least: int = 1
 
     def chunks(self, realizations: int, memory_budget: int | None = None) -> Chunks:
         """The chunks of so many realizations that are still wanted, within bytes for all under way."""
@@ -57,7 +59,7 @@ class Layout:
         threads = torch.get_num_threads() if self.device.type == "cpu" else 1
         if self.fused:
             workers = max(1, min(threads, realizations))
-            part = -(-realizations // (PARTS * workers))
+            part = max(-(-realizations // (PARTS * workers)), min(self.least, -(-realizations // workers)))
             size = max(1, min(part, self.largest, budget // workers // self.held))
             return Chunks(-(-size // self.group) * self.group, workers)
         fitting = budget // (self.group * self.held)
@@ -75,7 +77,7 @@ def layout(scene: Scene, method: str, device: torch.device) -> Layout:
     cut = scene if part is None or fused else part.scene(scene)
     one = replace(footprint.footprint(cut, method, fused), results=footprint.footprint(scene, method, fused).results)
     every, n_times = scene.distinct_realizations, len(scene.times)
-    together, few = TOGETHER[device.type], max(1, every // GROUPS)
+    least, together, few = 1, TOGETHER[device.type], max(1, every // GROUPS)
     window = n_times if fused else min(n_times, max(1, together // one.state))
     held = one.state if fused else one.matrices + one.state * window
     footprint.check(scene, one, 1 if fused else window, BLOCKS + every.bit_length(), device)
@@ -83,10 +85,10 @@ def layout(scene: Scene, method: str, device: torch.device) -> Layout:
     if fused:
         group = min(few, DECOMPOSED[device.type] // (64 * scene.n_particles**2))
         points = max(1, len(scene.tones)) * scene.n_particles * max(n_times, int(scene.times[-1]))
-        largest = CHUNK_WORK // points
+        largest, least = CHUNK_WORK // points, SMALL_WORK // points
     else:
         few = max(1, min(few, together // scene.n_particles))  # masses of the whole chains
         few = 1 if scene.position_disorder else few  # places have no axis of realizations
         group = largest = min(few, (one.matrices + together) // held)
     group = -(-max(1, group) // scene.sample_size) * scene.sample_size  # whole samples
-    return Layout(device, fused, part, window, group, held, largest)
+    return Layout(device, fused, part, window, group, held, largest, least)

@@ -12,6 +12,8 @@ from torchchain import checks
 
 LONGEST_FLOW = 1e9
 """Largest rate times time for the matrix exponential, whose rounding grows with it: 1e-7 or so there, all digits at 1e16."""
+MOST_STEPS = 64
+"""Matrix exponentials of different steps that are kept at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +170,8 @@ def propagate_embedded(parts: Embedding, initial: Tensor, times: Tensor, supply:
 def flows(start: Tensor, generator: Tensor, times: Tensor) -> Tensor:
     """start exp(generator t) at each time, (*batch, time, state), from start (*batch, state).
 
-    The times are cut into stretches of equal steps. In each, one matrix exponential, its squares, and products that
-    double the number of times each.
+    The times are cut into stretches of equal steps. In each, the matrix exponential of the step, its squares, and products
+    that double the number of times each.
 
     Raises:
         FieldError: for a time at which rounding has blurred the rates.
@@ -180,8 +182,14 @@ def flows(start: Tensor, generator: Tensor, times: Tensor) -> Tensor:
     if float(times[0]) > 0:
         start = start @ torch.linalg.matrix_exp(generator * times[0])
     paths = [start[..., None, :]]
+    exponentials: dict[str, Tensor] = {}
     for step, count in equal_steps(times):
-        path, power = paths[-1][..., -1:, :], torch.linalg.matrix_exp(generator * step)
+        name = f"{step:.12g}"
+        if name not in exponentials:
+            if len(exponentials) == MOST_STEPS:
+                exponentials.clear()
+            exponentials[name] = torch.linalg.matrix_exp(generator * step)
+        path, power = paths[-1][..., -1:, :], exponentials[name]
         while path.shape[-2] <= count:
             path = torch.cat([path, path[..., : count + 1 - path.shape[-2], :] @ power], dim=-2)
             power = power @ power

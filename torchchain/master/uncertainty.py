@@ -247,7 +247,8 @@ def winsorized(values: Tensor) -> tuple[Tensor, Tensor]:
     off = values - _median(values)
     most = FAR / NORMAL_MEDIAN * _median(off.abs())
     off = torch.maximum(torch.minimum(off, most), -most)
-    return off.std(0), off - off.mean(0)
+    off -= off.mean(0)
+    return (off.square().sum(0) / (len(off) - 1)).sqrt(), off  # several times as fast as torch's std along this axis
 
 
 def _own(values: Tensor) -> Tensor:
@@ -286,10 +287,12 @@ def kept_times(times: Tensor, most: int = MOST_TIMES) -> Tensor:
 
 
 def later_times(end: float) -> Tensor:
-    """Times beyond the last at which :func:`horizon` looks, (48,)."""
+    """Times beyond the last at which :func:`horizon` looks, (48,): at equal steps up to twice that, and from there to each power of ten."""
+    ends = [end, 2 * end, *(end * 10.0**i for i in range(1, round(math.log10(AHEAD)) + 1))]
+    counts = [24] + [6] * (len(ends) - 2)
     return torch.cat([
-        torch.linspace(end, 2 * end, 24, dtype=torch.float64),
-        end * torch.logspace(0.35, math.log10(AHEAD), 24, dtype=torch.float64),
+        torch.linspace(a, b, count + (a > end), dtype=torch.float64)[a > end :]
+        for a, b, count in zip(ends[:-1], ends[1:], counts, strict=True)
     ])  # fmt: skip
 
 
@@ -307,12 +310,15 @@ def horizon(transfer: BandTransfer, model: TransferModel) -> float:
     noise = 2 * float(statistical_distance(transfer.stderr[:, late]).mean())
     if not math.isfinite(noise):  # of one chain nothing tells whether it has settled
         return end
-    settled = float(total_variation(transfer.mean[:, late], transfer.long_time[:, None]).mean())
+    if float(total_variation(transfer.mean[:, late], transfer.long_time[:, None]).mean()) > noise:
+        return end
+    later = later_times(end).to(transfer.times)
     try:
-        foreseen = model.transfer(later_times(end).to(transfer.times)).detach()
+        for times in (later[-1:], later):
+            foreseen = model.transfer(times).detach()
+            ahead = float(total_variation(foreseen, transfer.long_time[:, None]).mean(0).max())
+            if not ahead <= noise:  # nor where it is not a number
+                return end
     except checks.FieldError:  # rates that rounding has blurred by then
         return end
-    if not bool(foreseen.isfinite().all()):
-        return end
-    ahead = float(total_variation(foreseen, transfer.long_time[:, None]).mean(0).max())
-    return math.inf if settled <= noise and ahead <= noise else end
+    return math.inf

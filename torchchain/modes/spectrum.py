@@ -152,13 +152,14 @@ def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
         others = others - uniform * (uniform.mT @ others)
         vectors = torch.cat([uniform, others], dim=-1)
     shapes = vectors * weight[..., :, None]
-    elongation = chain.elongation(shapes.mT)  # (*batch, mode, contact)
+    across = shapes.mT.contiguous()  # (*batch, mode, particle)
+    elongation = chain.elongation(across)
     tension = chain.contact_stiffness[..., None, :] * elongation
     squared = (tension * elongation).sum(-1)
     force = chain.net(tension) * weight[..., None, :]
-    residual = (force + squared[..., :, None] * shapes.mT / weight[..., None, :]).detach().abs().amax((-2, -1))
+    residual = (force + squared[..., :, None] * across / weight[..., None, :]).detach().abs().amax((-2, -1))
     gram = (vectors.mT @ vectors).detach()
-    gram = gram - torch.eye(chain.n_particles, dtype=gram.dtype, device=gram.device)
+    gram.diagonal(dim1=-2, dim2=-1).sub_(1)
     orthogonality = gram.abs().amax((-2, -1))
     limit = 40 * torch.finfo(shapes.dtype).eps * chain.n_particles**0.5
     where = checks.first(~((residual <= limit * squared.detach().amax(-1)) & (orthogonality <= limit)))
