@@ -89,19 +89,7 @@ class Scaling(checks.Fields):
         checks.choice("quantity", quantity, QUANTITIES)
         mass = 4 / 3 * math.pi * self.radius**3 * self.density
         length = self.overlap
-        stiffness = 1.5 * self.contact_constant * math.sqrt(length)
-        time = math.sqrt(mass / stiffness)
-        return {
-            "time": time,
-            "length": length,
-            "velocity": length / time,
-            "mass": mass,
-            "force": stiffness * length,
-            "energy": stiffness * length**2,
-            "stiffness": stiffness,
-            "frequency": 1 / (2 * math.pi * time),
-            "damping": stiffness * time,
-        }[quantity]
+        return derived_units(mass, 1.5 * self.contact_constant * math.sqrt(length), length)[quantity]
 
     def to_si(self, quantity: str, value: Any) -> Any:
         """A dimensionless value in SI units; tensors and arrays pass through."""
@@ -110,6 +98,22 @@ class Scaling(checks.Fields):
     def from_si(self, quantity: str, value: Any) -> Any:
         """A value in SI units made dimensionless; tensors and arrays pass through."""
         return value / self.unit(quantity)
+
+
+def derived_units(mass: float, stiffness: float, length: float) -> dict[str, float]:
+    """Units of all quantities from those of three."""
+    time = math.sqrt(mass / stiffness)
+    return {
+        "time": time,
+        "length": length,
+        "velocity": length / time,
+        "mass": mass,
+        "force": stiffness * length,
+        "energy": stiffness * length**2,
+        "stiffness": stiffness,
+        "frequency": 1 / (2 * math.pi * time),
+        "damping": stiffness * time,
+    }
 
 
 FAR = 2.0

@@ -42,22 +42,22 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
     displacement, velocity = trajectory.displacement, trajectory.velocity
     masses = chain.align(chain.masses, velocity)
     if definition == "site":
-        moving = _product(_transform(masses * velocity), _transform(velocity))
+        moving = product(transform(masses * velocity), transform(velocity))
         if chain.is_uniform_ring:
             k = 2 * math.pi / n * torch.arange(n // 2 + 1, dtype=velocity.dtype, device=velocity.device)
             strain = chain.contact_stiffness.flatten()[0] * 4 * torch.sin(k / 2).square()
-            wave = _transform(displacement)
-            bound = strain * _product(wave, wave)
+            wave = transform(displacement)
+            bound = strain * product(wave, wave)
         else:
             displacement = chain.without_rigid_motion(displacement)
-            bound = -_product(_transform(chain.force(displacement)), _transform(displacement))
+            bound = -product(transform(chain.force(displacement)), transform(displacement))
         energy = (moving + bound) / 2
     else:
         _require_ring(chain)
         elongation = chain.elongation(displacement)
-        moved = _transform(masses.sqrt() * velocity)
-        stretched = _transform(chain.align(chain.contact_stiffness, elongation).sqrt() * elongation)
-        energy = (_product(moved, moved) + _product(stretched, stretched)) / 2
+        moved = transform(masses.sqrt() * velocity)
+        stretched = transform(chain.align(chain.contact_stiffness, elongation).sqrt() * elongation)
+        energy = (product(moved, moved) + product(stretched, stretched)) / 2
     # k and -k are added: twice the value, except where they are one wavenumber.
     energy[..., 1 : (n + 1) // 2] *= 2
     return checks.finite("energy of trajectory", energy, "wavenumber")
@@ -68,11 +68,12 @@ def _require_ring(chain: Chain) -> None:
         raise checks.fail("boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary))
 
 
-def _transform(field: Tensor) -> Tensor:
+def transform(field: Tensor) -> Tensor:
+    """Unitary transform of a real field, (*any, wavenumber)."""
     return torch.fft.rfft(field, norm="ortho")
 
 
-def _product(a: Tensor, b: Tensor) -> Tensor:
+def product(a: Tensor, b: Tensor) -> Tensor:
     """Re(a conj(b)), without forming the imaginary part."""
     return a.real * b.real + a.imag * b.imag
 
@@ -196,8 +197,8 @@ def long_time_band_energy(
     frequency = chain.align(modes.frequencies, displacement)
     swing = frequency * displacement
     energy = (swing.square() + velocity.square()) / 2
-    pairs = _mode_transforms(chain, modes, definition)
-    bands = change_basis(energy, _mean_weight(pairs, n_bands))
+    pairs = mode_transforms(chain, modes, definition)
+    bands = change_basis(energy, mean_weight(pairs, n_bands))
     # Cross terms of modes of one frequency, those with the next mode, with the next but one, ... while there are any.
     step = modes.frequencies.diff(dim=-1)
     beside = step <= 64 * torch.finfo(step.dtype).eps * modes.frequencies[..., -1:]
@@ -207,7 +208,7 @@ def long_time_band_energy(
         cross = torch.where(chain.align(equal, cross), cross, torch.zeros_like(cross))
         upper = [(left[..., d:, :], right[..., :-d, :]) for left, right in pairs]
         lower = [(left[..., :-d, :], right[..., d:, :]) for left, right in pairs]
-        weight = _mean_weight(upper, n_bands) + _mean_weight(lower, n_bands)
+        weight = mean_weight(upper, n_bands) + mean_weight(lower, n_bands)
         bands = bands + change_basis(cross, weight) / 2
         equal, d = equal[..., :-1] & beside[..., d:], d + 1
     if not normalize:
@@ -217,27 +218,27 @@ def long_time_band_energy(
     return bands / total
 
 
-def _mode_transforms(chain: Chain, modes: NormalModes, definition: str) -> list[tuple[Tensor, Tensor]]:
+def mode_transforms(chain: Chain, modes: NormalModes, definition: str) -> list[tuple[Tensor, Tensor]]:
     """Pairs of transforms (*batch, mode, wavenumber); the mean of their products is where a mode's energy is."""
     shapes = modes.shapes.mT
     if definition == "site":
-        return [(_transform(chain.masses[..., None, :] * shapes), _transform(shapes))]
+        return [(transform(chain.masses[..., None, :] * shapes), transform(shapes))]
     _require_ring(chain)
-    moved = _transform(chain.masses.sqrt()[..., None, :] * shapes)
-    stretched = _transform(chain.contact_stiffness.sqrt()[..., None, :] * chain.elongation(shapes))
+    moved = transform(chain.masses.sqrt()[..., None, :] * shapes)
+    stretched = transform(chain.contact_stiffness.sqrt()[..., None, :] * chain.elongation(shapes))
     still = modes.frequencies[..., None] == 0  # the zero mode has kinetic energy alone
     stretched = torch.where(still, moved, stretched / modes.frequencies[..., None].masked_fill(still, 1))
     return [(moved, moved), (stretched, stretched)]
 
 
-def _mean_weight(pairs: list[tuple[Tensor, Tensor]], n_bands: int) -> Tensor:
+def mean_weight(pairs: list[tuple[Tensor, Tensor]], n_bands: int) -> Tensor:
     """Mean over the pairs of their products in bands, (*batch, mode, band)."""
     return torch.stack([_band_weight(left, right, n_bands) for left, right in pairs]).mean(0)
 
 
 def _band_weight(moment: Tensor, wave: Tensor, n_bands: int) -> Tensor:
     """Re(moment conj(wave)) in bands, k and -k added, (*batch, mode, band)."""
-    weight = _product(moment, wave)
+    weight = product(moment, wave)
     weight[..., 1:-1] *= 2
     return bin_energy(weight, n_bands)
 

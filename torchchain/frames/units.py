@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.chain.scaling import derived_units
 from torchchain.frames.doubts import here
 from torchchain.frames.record import AXES, Box, Contacts, Frame
 
@@ -41,11 +41,7 @@ class ContactUnits:
 
     def unit(self, quantity: str) -> float:
         """The file's value of the dimensionless 1 of a quantity."""
-        time = math.sqrt(self.mass / self.stiffness)
-        known = {
-            "time": time, "length": self.length, "velocity": self.length / time, "mass": self.mass, "stiffness": self.stiffness,
-            "force": self.stiffness * self.length, "energy": self.stiffness * self.length**2,
-        }  # fmt: skip
+        known = derived_units(self.mass, self.stiffness, self.length)
         return known[checks.choice("quantity", quantity, known)]
 
 

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.excitation import StandingWave
-from torchchain.energy.bands import bin_energy, check_bands
+from torchchain.energy.bands import check_bands
+from torchchain.energy.wavenumber import mean_weight, mode_transforms
 from torchchain.ensemble.scene import Scene
 from torchchain.master.equation import MasterEquation
 from torchchain.mixing.bands import FrequencyBands
@@ -83,13 +84,7 @@ class NonlinearMasterEquation:
         Raises:
             FieldError: for a model without a scene, or of lattices.
         """
-        checks.instance("linear", linear, MasterEquation)
-        scene = linear.calibration.scene
-        if scene is None:
-            raise checks.fail(
-                "linear", "be calibrated on a scene, whose modes tell its spectrum", "data without a scene"
-            )
-        return cls(linear, triads, *spectrum_and_shapes(scene, triads.bands))
+        return cls(linear, triads, *spectrum_and_shapes(scene_of(linear), triads.bands))
 
     def solve(self, initial: Any, times: Any, energy_per_particle: float, **options: Any) -> Tensor:
         """Energies in the bands of wavenumber at the given times.
@@ -183,6 +178,15 @@ class NonlinearMasterEquation:
             ) from None
 
 
+def scene_of(linear: MasterEquation) -> Scene:
+    """What the model was calibrated on; an error if that was no scene."""
+    checks.instance("linear", linear, MasterEquation)
+    scene = linear.calibration.scene
+    if scene is None:
+        raise checks.fail("linear", "be calibrated on a scene, whose modes tell its spectrum", "data without a scene")
+    return scene
+
+
 def spectrum_and_shapes(scene: Scene, bands: FrequencyBands, realizations: int = 32) -> tuple[Tensor, Tensor]:
     """P [source, frequency] and F [frequency, receiver] of :class:`NonlinearMasterEquation`, from normal modes.
 
@@ -212,8 +216,5 @@ def spectrum_and_shapes(scene: Scene, bands: FrequencyBands, realizations: int =
     amplitude = modal_amplitudes(chain, wave, modes)[0]
     energy = change_basis((modes.frequencies[:, None] * amplitude).square(), members)
     spectrum = (energy / energy.sum(-1, keepdim=True)).mean(0).unflatten(0, (scene.n_bands, width)).mean(1)
-    moved, shape = (torch.fft.rfft(x.mT, norm="ortho") for x in (chain.masses[..., None] * modes.shapes, modes.shapes))
-    share = (moved * shape.conj()).real
-    share[..., 1:-1] *= 2
-    shapes = bin_energy((members.mT @ share).sum(0), scene.n_bands)
+    shapes = (members.mT @ mean_weight(mode_transforms(chain, modes, "site"), scene.n_bands)).sum(0)
     return spectrum / spectrum.sum(-1, keepdim=True), shapes / shapes.sum(-1, keepdim=True)

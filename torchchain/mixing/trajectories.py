@@ -14,12 +14,11 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.ensemble.scene import Scene
 from torchchain.master.adam import AdamReport
 from torchchain.master.equation import MasterEquation
 from torchchain.mixing.bands import FrequencyBands
 from torchchain.mixing.fit import CLOSURE
-from torchchain.mixing.master import NonlinearMasterEquation
+from torchchain.mixing.master import NonlinearMasterEquation, scene_of
 from torchchain.mixing.triads import TriadModel, triads_of
 from torchchain.modes.spectrum import normal_modes
 
@@ -53,7 +52,7 @@ class TrajectoryLoss:
         self, linear: MasterEquation, times: Any, energies: Any, bands: FrequencyBands | None = None,
         stderr: Any = None, rtol: float = 1e-4,
     ) -> None:  # fmt: skip
-        scene = _scene_of(linear)
+        scene = scene_of(linear)
         chain = scene.chain(range(min(CHAINS, scene.realizations)))
         bands = FrequencyBands.covering(chain) if bands is None else bands
         checks.instance("bands", bands, FrequencyBands)
@@ -184,11 +183,3 @@ def fit_trajectories(
     coupling.grad = None
     settled = least > (1 - SETTLED) * min(losses[: 1 + 3 * steps // 4])
     return loss.model, AdamReport(settled, steps, least, losses[0], "exact", 0.0)
-
-
-def _scene_of(linear: MasterEquation) -> Scene:
-    checks.instance("linear", linear, MasterEquation)
-    scene = linear.calibration.scene
-    if scene is None:
-        raise checks.fail("linear", "be calibrated on a scene, whose modes tell its spectrum", "data without a scene")
-    return scene

@@ -14,6 +14,7 @@ from torchchain.chain.excitation import StandingWave
 from torchchain.chain.states import State, Trajectory
 from torchchain.energy.bands import bin_energy, center_tones
 from torchchain.energy.space import DEFINITIONS, particle_energy, require_linear
+from torchchain.energy.wavenumber import product, transform
 from torchchain.species.mixtures import MixedChain
 
 
@@ -86,7 +87,7 @@ def species_band_energy(
     parts = _parts(chain, velocity, labels, n_species)
     if definition == "site":
         displacement = chain.without_rigid_motion(displacement)
-        speed, wave = _transform(velocity), _transform(displacement)
+        speed, wave = transform(velocity), transform(displacement)
         momentum, force = masses * velocity, -chain.force(displacement)
     else:
         moving = masses.sqrt() * velocity
@@ -94,10 +95,11 @@ def species_band_energy(
         stretched = chain.align(chain.contact_stiffness, elongation).sqrt() * elongation
     for part in parts:
         if definition == "site":
-            energy = (_transform(momentum * part) * speed.conj() + _transform(force * part) * wave.conj()).real / 2
+            energy = (product(transform(momentum * part), speed) + product(transform(force * part), wave)) / 2
         else:
             share = chain.of_both_ends(part) / 2
-            energy = (_squared(moving * part) + _squared(share.sqrt() * stretched)) / 2
+            moved, strained = transform(moving * part), transform(share.sqrt() * stretched)
+            energy = (product(moved, moved) + product(strained, strained)) / 2
         energy[..., 1 : (n + 1) // 2] *= 2  # k and -k are added, except where they are one wavenumber
         if definition == "bond":
             energy[..., 1] += energy[..., 0]
@@ -129,14 +131,6 @@ def species_waves(chain: MixedChain, wave: StandingWave, n_bands: int, chosen: S
     velocity = [moving[..., (band - 1) % n_bands, :] * (chain.labels == (band - 1) // n_bands) for band in chosen]
     speed = torch.stack(velocity, dim=-2)
     return State(torch.zeros_like(speed), speed)
-
-
-def _transform(field: Tensor) -> Tensor:
-    return torch.fft.rfft(field, norm="ortho")
-
-
-def _squared(field: Tensor) -> Tensor:
-    return _transform(field).abs().square()
 
 
 def _parts(chain: Chain, field: Tensor, labels: Tensor, n_species: int) -> list[Tensor]:
