@@ -290,7 +290,7 @@ def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Ch
     if units is not None:
         damping = damping * units.unit("time") / units.unit("mass")
         stiffness = stiffness if isinstance(stiffness, str) else stiffness / units.unit("stiffness")
-    if line_axis(frames[0].name, frames[0].first, flags.axis) is None:
+    if line_axis(frames[0].first, flags.axis) is None:
         grains = [
             each.network(run.reference, stiffness=stiffness, contact=flags.contact, damping=damping)
             for run, each in zip(files, frames, strict=True)

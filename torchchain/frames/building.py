@@ -17,6 +17,7 @@ from torchchain import checks
 from torchchain.frames import mercury
 from torchchain.frames.doubts import warn
 from torchchain.frames.opening import File, Place, time_of
+from torchchain.frames.passes import where
 from torchchain.frames.record import AXES, Box, Contacts, Frame
 from torchchain.frames.registry import Raw
 from torchchain.frames.text import readable
@@ -24,7 +25,7 @@ from torchchain.frames.text import readable
 
 def build(place: Place, raw: Raw, contacts: Raw | None, first: Frame | None, options: dict[str, Any]) -> Frame:
     """A frame from its numbers: in the order of the ids, checked against the first."""
-    at = f"{place.file.path.name}, frame {place.entry.number}"
+    at = where(place.file.path.name, place.entry.number)
     columns = raw.columns
     if "id" not in columns:
         raise checks.fail(
@@ -65,26 +66,20 @@ def build(place: Place, raw: Raw, contacts: Raw | None, first: Frame | None, opt
         masses=column("mass") if "mass" in columns else None,
         radii=column("radius") if "radius" in columns else None,
         box=_marked(raw.box, options),
+        source=at,
     )
     if first is None:
         types = columns["type"][order] if "type" in columns else None
-        return replace(frame, **masses_of(at, frame, types, place.file, options))
-    check_same(at, frame, first)
+        return replace(frame, **masses_of(frame, types, place.file, options))
+    check_same(frame, first)
     frame = replace(
         frame, ids=first.ids, masses=first.masses, radii=first.radii if frame.radii is None else frame.radii
     )
     if contacts is not None:
         assert place.contact_file is not None
         assert place.contact_entry is not None
-        frame = replace(
-            frame,
-            contacts=contacts_of(
-                f"{place.contact_file.path.name}, frame {place.contact_entry.number}",
-                contacts.columns,
-                frame,
-                place.file.path.name,
-            ),
-        )
+        listed = where(place.contact_file.path.name, place.contact_entry.number)
+        frame = replace(frame, contacts=contacts_of(listed, contacts.columns, frame, place.file.path.name))
     return frame
 
 
@@ -125,7 +120,7 @@ def kept(frame: Frame, places: Tensor) -> Frame:
     )
 
 
-def check_same(at: str, frame: Frame, first: Frame) -> None:
+def check_same(frame: Frame, first: Frame) -> None:
     """An error for a frame with other particles, columns or properties than the first."""
     if not torch.equal(frame.ids, first.ids):
         missing, new = first.ids[~torch.isin(first.ids, frame.ids)], frame.ids[~torch.isin(frame.ids, first.ids)]
@@ -135,23 +130,23 @@ def check_same(at: str, frame: Frame, first: Frame) -> None:
             if len(part)
         ]
         raise checks.fail(
-            f"{at}: id", f"be those of the {len(first.ids)} particles of the first frame", " and ".join(words)
+            frame.at("id"), f"be those of the {len(first.ids)} particles of the first frame", " and ".join(words)
         )
     if frame.axes != first.axes or frame.unwrapped != first.unwrapped:
-        raise checks.fail(f"{at}: positions", "be as in the first frame", ", ".join(frame.axes))
-    check_properties(at, frame, first, "stay as in the first frame (have particles come or gone?)")
+        raise checks.fail(frame.at("positions"), "be as in the first frame", ", ".join(frame.axes))
+    check_properties(frame, first, "stay as in the first frame (have particles come or gone?)")
 
 
-def check_properties(at: str, frame: Frame, other: Frame, rule: str) -> None:
+def check_properties(frame: Frame, other: Frame, rule: str) -> None:
     """An error for masses or radii, where both frames have them, that differ from those of another frame."""
     for name in ("masses", "radii"):
         a, b = getattr(frame, name), getattr(other, name)
         if a is not None and b is not None and not torch.equal(a, b):
             bad = int((a != b).nonzero()[0])
-            raise checks.fail(f"{at}: {name}", rule, f"{a[bad]:g} against {b[bad]:g} of id {int(other.ids[bad])}")
+            raise checks.fail(frame.at(name), rule, f"{a[bad]:g} against {b[bad]:g} of id {int(other.ids[bad])}")
 
 
-def masses_of(at: str, frame: Frame, types: np.ndarray | None, file: File, options: dict[str, Any]) -> dict[str, Any]:
+def masses_of(frame: Frame, types: np.ndarray | None, file: File, options: dict[str, Any]) -> dict[str, Any]:
     """Masses (and ids) of the first frame from elsewhere, where the file has none."""
     given, density = options.get("masses"), options.get("density")
     n = len(frame.ids)
@@ -165,29 +160,29 @@ def masses_of(at: str, frame: Frame, types: np.ndarray | None, file: File, optio
         return {}
     if density is not None:
         if frame.radii is None:
-            raise checks.fail(f"{at}: radius", "be in the file for masses from a density", "none")
+            raise checks.fail(frame.at("radius"), "be in the file for masses from a density", "none")
         volume = math.pi * frame.radii**2 if len(frame.axes) == 2 else 4 / 3 * math.pi * frame.radii**3
         if bool((volume == 0).any()):
-            raise checks.fail(f"{at}: radius", "be positive for masses from a density", "0")
+            raise checks.fail(frame.at("radius"), "be positive for masses from a density", "0")
         return {"masses": density * volume}
     if given is None:
         beside = file.format.sibling(file.path)
         if beside is None:
             return {}
         try:
-            return {"masses": _of_restart(at, frame, mercury.read_restart(readable("masses", beside)), beside.name)}
+            return {"masses": _of_restart(frame, mercury.read_restart(readable("masses", beside)), beside.name)}
         except checks.FieldError as error:
-            warn(f"{at}: masses", f"none, as the file beside it cannot serve: {error}")
+            warn(frame.at("masses"), f"none, as the file beside it cannot serve: {error}")
             return {}
     if isinstance(given, (str, os.PathLike)):
         path = readable("masses", Path(given))
-        return {"masses": _of_restart(at, frame, mercury.read_restart(path), path.name)}
+        return {"masses": _of_restart(frame, mercury.read_restart(path), path.name)}
     if isinstance(given, Mapping):
         if types is None:
-            raise checks.fail(f"{at}: type", "be in the file for masses of types", "none")
+            raise checks.fail(frame.at("type"), "be in the file for masses of types", "none")
         unknown = [int(kind) for kind in np.unique(types) if int(kind) not in given]
         if unknown:
-            raise checks.fail("masses", f"hold the type {unknown[0]} of {at}", checks.shown(dict(given)))
+            raise checks.fail("masses", f"hold the type {unknown[0]} of {frame.source}", checks.shown(dict(given)))
         known = {kind: checks.number("masses", value, above=0.0) for kind, value in given.items()}
         return {"masses": torch.tensor([known[int(kind)] for kind in types], dtype=torch.float64)}
     values = checks.real_tensor("masses", given).to(torch.float64)
@@ -197,10 +192,10 @@ def masses_of(at: str, frame: Frame, types: np.ndarray | None, file: File, optio
     return {"masses": values.expand(n).clone()}
 
 
-def _of_restart(at: str, frame: Frame, found: dict[str, np.ndarray], name: str) -> Tensor:
+def _of_restart(frame: Frame, found: dict[str, np.ndarray], name: str) -> Tensor:
     """Masses from a .restart file, whose particles are in the order of the .data file's rows."""
     if len(found["mass"]) != len(frame.ids):
-        raise checks.fail(f"{name}: Particles", f"be the {len(frame.ids)} of {at}", len(found["mass"]))
+        raise checks.fail(f"{name}: Particles", f"be the {len(frame.ids)} of {frame.source}", len(found["mass"]))
     radii = torch.from_numpy(found["radius"])
     if frame.radii is not None:
         # Text of both files has ten digits or more.
@@ -209,7 +204,7 @@ def _of_restart(at: str, frame: Frame, found: dict[str, np.ndarray], name: str) 
             i = int(bad.nonzero()[0])
             raise checks.fail(
                 f"{name}: radius",
-                f"be that of {at}",
+                f"be that of {frame.source}",
                 f"{float(radii[i]):g} against {float(frame.radii[i]):g} of particle {i}",
             )
     return torch.from_numpy(found["mass"])

@@ -27,11 +27,6 @@ def warn(field: str, words: str) -> None:
     warnings.warn(FramesWarning(" ".join(f"{field}: {words}".split())), stacklevel=level)
 
 
-def here(name: str, frame: Frame) -> str:
-    """File and frame, as errors begin."""
-    return f"{name}, frame {frame.number}"
-
-
 def significant_digits(values: Tensor) -> int:
     """Decimal digits after which all values end, 5 to 12; 16 if they have more."""
     values = values[values != 0].abs()
@@ -45,7 +40,7 @@ def significant_digits(values: Tensor) -> int:
     return 16
 
 
-def check_digits(name: str, frame: Frame, axes: list[str], moved: Tensor, length: float) -> None:
+def check_digits(frame: Frame, axes: list[str], moved: Tensor, length: float) -> None:
     """A warning where the digits of the positions, or of their share of the box, are too few for the displacements."""
     for column, axis in enumerate(axes):
         size = float(moved[..., column].square().mean().sqrt()) * length
@@ -65,14 +60,14 @@ def check_digits(name: str, frame: Frame, axes: list[str], moved: Tensor, length
             error = step / math.sqrt(12)  # of a value that is rounded, rms
             if error > NOISE * size:
                 warn(
-                    f"{here(name, frame)}: {axis}",
+                    frame.at(axis),
                     f"positions of {digits} digits, in steps of {step / length:.2g}, for displacements of {size / length:.2g} (rms): off by {error / size:.1g} of themselves"
                     " (LAMMPS: dump_modify ... format float %.15g)",
                 )
                 return
 
 
-def check_bounds(name: str, frame: Frame, axis: str, moved: Tensor, length: float) -> None:
+def check_bounds(frame: Frame, axis: str, moved: Tensor, length: float) -> None:
     """A warning where particles crossed a box whose bounds are rounded to six digits, as LIGGGHTS writes them."""
     if frame.box is None:
         return
@@ -83,13 +78,13 @@ def check_bounds(name: str, frame: Frame, axis: str, moved: Tensor, length: floa
             error = 0.5 * 10.0 ** (math.floor(math.log10(abs(bound))) - 5)
             if error > NOISE * size:
                 warn(
-                    f"{here(name, frame)}: box",
+                    frame.at("box"),
                     f"the bound {bound / length:.6g} along {axis} has six digits: if it is rounded, displacements beyond it are off by up to {error / size:.1g} of their size {size / length:.2g} (dump {axis}u)",
                 )
                 return
 
 
-def check_across(name: str, frame: Frame, axis: str) -> None:
+def check_across(frame: Frame, axis: str) -> None:
     """A warning for motion across the axis of a chain."""
     if frame.velocities is None or len(frame.axes) < 2:
         return
@@ -97,7 +92,7 @@ def check_across(name: str, frame: Frame, axis: str) -> None:
     along, total = float(square[frame.axes.index(axis)]), float(square.sum())
     if total > 0 and total - along > 1e-6 * total:
         warn(
-            f"{here(name, frame)}: velocities",
+            frame.at("velocities"),
             f"{(total - along) / total:.2g} of the squares are across the chain's axis {axis}, and are left out",
         )
 

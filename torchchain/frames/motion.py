@@ -10,7 +10,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.chain.states import Trajectory
 from torchchain.frames.building import check_properties
-from torchchain.frames.doubts import check_across, check_bounds, check_digits, here, warn
+from torchchain.frames.doubts import check_across, check_bounds, check_digits, warn
 from torchchain.frames.order import check_contact_order, line_axis, line_order
 from torchchain.frames.record import AXES, TIMED, Box, Frame
 from torchchain.memory import gigabytes, memory
@@ -18,27 +18,25 @@ from torchchain.network import NetworkTrajectory
 
 
 def displacements(
-    name: str,
     frames: Iterable[Frame],
     n_frames: int,
     first: Frame,
     reference: Frame,
-    reference_name: str,
     axis: str | None,
     length: float,
 ) -> Trajectory:
     """Displacements from a reference, and velocities; see :meth:`Frames.trajectory`."""
-    _check_alike(name, first, reference, reference_name)
-    line = line_axis(name, first, axis)
+    _check_alike(first, reference)
+    line = line_axis(first, axis)
     columns = list(range(len(first.axes))) if line is None else [first.axes.index(line)]
-    order = torch.arange(len(first.ids)) if line is None else line_order(name, first, line)
+    order = torch.arange(len(first.ids)) if line is None else line_order(first, line)
     if line is not None:
-        check_contact_order(name, first, order, line)
+        check_contact_order(first, order, line)
     size = 16 * n_frames * len(order) * len(columns)
     limit = memory(torch.device("cpu"))
     if size > limit:
         raise checks.fail(
-            f"{name}: frames",
+            first.at("frames"),
             f"fit into the {gigabytes(limit)} of memory of this machine (take fewer, as in frames[::10])",
             f"{gigabytes(size)} of displacements and velocities",
         )
@@ -51,39 +49,39 @@ def displacements(
         for c in columns
     ]
     before = torch.zeros_like(rest)
-    last, numbers, crossed = first, [], set[int]()
+    last, sources, crossed = first, [], set[int]()
     for k, frame in enumerate(frames):
         if frame.velocities is None:
             raise checks.fail(
-                f"{here(name, frame)}: velocities",
+                frame.at("velocities"),
                 f"be in the file (columns {' '.join('v' + a for a in frame.axes)})",
                 "none",
             )
         if frame.time is None:
             raise checks.fail(
-                f"{here(name, frame)}: TIME",
+                frame.at("TIME"),
                 TIMED,
                 "none",
             )
         u = frame.positions[order][:, columns] - rest
         for i, (column, side) in enumerate(zip(columns, wraps, strict=True)):
             if side:
-                _check_box(name, frame, reference, first.axes[column])
+                _check_box(frame, reference, first.axes[column])
                 turns = ((u[:, i] - before[:, i]) / side).round()
                 u[:, i] -= side * turns
                 if bool(turns.any()):
                     crossed.add(column)
             elif frame.box is not None and not frame.unwrapped[column]:
-                _check_jump(name, frame, u[:, i], first.axes[column])
+                _check_jump(frame, u[:, i], first.axes[column])
         times[k], moved[k], velocity[k], before = frame.time, u, frame.velocities[order][:, columns], u
         last = frame
-        numbers.append(frame.number)
-    check_digits(name, last, [first.axes[c] for c in columns], moved, length)
+        sources.append(frame.source)
+    check_digits(last, [first.axes[c] for c in columns], moved, length)
     for column in sorted(crossed):
-        check_bounds(name, last, first.axes[column], moved, length)
+        check_bounds(last, first.axes[column], moved, length)
     if line is not None:
-        _check_line(name, numbers, moved[..., 0], first, reference, order, line)
-        check_across(name, last, line)
+        _check_line(sources, moved[..., 0], first, reference, order, line)
+        check_across(last, line)
         return Trajectory(times - times[0], moved[..., 0], velocity[..., 0])
     return NetworkTrajectory(times - times[0], moved, velocity)
 
@@ -92,55 +90,46 @@ def _period(box: Box | None, axis: str) -> float:
     return 0.0 if box is None else box.period(axis)
 
 
-def _check_alike(name: str, first: Frame, reference: Frame, reference_name: str) -> None:
+def _check_alike(first: Frame, reference: Frame) -> None:
     """An error unless the reference has the same particles and axes."""
-    where = here(reference_name, reference)
     if reference.axes != first.axes:
-        raise checks.fail(
-            f"{where}: positions", f"be along {', '.join(first.axes)} as in {name}", ", ".join(reference.axes)
-        )
-    if len(reference.ids) != len(first.ids) or not torch.equal(reference.ids, first.ids):
-        raise checks.fail(
-            f"{where}: ids",
-            f"be those of {name}",
-            f"{len(reference.ids)} particles against {len(first.ids)}"
-            if len(reference.ids) != len(first.ids)
-            else "others",
-        )
-    check_properties(where, reference, first, f"be those of {name}")
+        words = f"be along {', '.join(first.axes)} as in {first.source}"
+        raise checks.fail(reference.at("positions"), words, ", ".join(reference.axes))
+    if not torch.equal(reference.ids, first.ids):
+        counts = f"{len(reference.ids)} particles against {len(first.ids)}"
+        others = "others" if len(reference.ids) == len(first.ids) else counts
+        raise checks.fail(reference.at("ids"), f"be those of {first.source}", others)
+    check_properties(reference, first, f"be those of {first.source}")
 
 
-def _check_box(name: str, frame: Frame, reference: Frame, axis: str) -> None:
+def _check_box(frame: Frame, reference: Frame, axis: str) -> None:
     now, then = _period(frame.box, axis), _period(reference.box, axis)
     if abs(now - then) > 1e-6 * then:
         raise checks.fail(
-            f"{here(name, frame)}: box",
+            frame.at("box"),
             f"keep its length {then:g} along {axis} for positions that wrap (or dump {axis}u)",
             f"{now:g}",
         )
 
 
-def _check_jump(name: str, frame: Frame, u: Tensor, axis: str) -> None:
+def _check_jump(frame: Frame, u: Tensor, axis: str) -> None:
     """An error for a particle that seems to have crossed a box that is not marked as periodic."""
     assert frame.box is not None
     length = float(frame.box.lengths[AXES.index(axis)])
     if length > 0 and bool((u.abs() > 0.9 * length).any()):
         bad = int(u.abs().argmax())
         raise checks.fail(
-            f"{here(name, frame)}: {axis}",
+            frame.at(axis),
             'stay on one side of a box that is not marked periodic (periodic="x" marks it)',
             f"a step of {float(u[bad]):g} for id {int(frame.ids[bad])}",
         )
 
 
-def _check_line(
-    name: str, numbers: list[int], moved: Tensor, first: Frame, reference: Frame, order: Tensor, axis: str
-) -> None:
+def _check_line(sources: list[str], moved: Tensor, first: Frame, reference: Frame, order: Tensor, axis: str) -> None:
     """An error for neighbors that passed each other, a warning for contacts that opened.
 
     Args:
-        name: of the file.
-        numbers: of the frames.
+        sources: of the frames.
         moved: displacements along the axis, (time, particle).
         first, reference: the first frame and the state at rest.
         order: of the chain.
@@ -157,12 +146,12 @@ def _check_line(
         gap <= 0 if not period else torch.full_like(gap, abs(float(gap.sum()) - period) > period / 2, dtype=torch.bool)
     )
     if bool(wrong.any()):
-        raise checks.fail(f"{name}: {axis}", "have the order of the reference in the first frame", "another order")
+        raise checks.fail(first.at(axis), "have the order of the reference in the first frame", "another order")
     crossed = gap + stretch <= 0
     if bool(crossed.any()):
         k, c = (int(i) for i in crossed.nonzero()[0])
         raise checks.fail(
-            f"{name}, frame {numbers[k]}: {axis}",
+            f"{sources[k]}: {axis}",
             "keep the order of the chain",
             f"ids {ids[c]} and {ids[(c + 1) % n]} past each other",
         )
@@ -175,7 +164,7 @@ def _check_line(
     if len(apart):
         c = int(apart[0])
         warn(
-            f"{here(name, reference)}: radius",
+            reference.at("radius"),
             f"ids {ids[c]} and {ids[c + 1]} do not touch in the reference, by {-float(overlap[c]):.3g}",
         )
         return
@@ -183,6 +172,6 @@ def _check_line(
     if bool(opened.any()):
         k, c = (int(i) for i in opened.nonzero()[0])
         warn(
-            f"{name}, frame {numbers[k]}: {axis}",
+            f"{sources[k]}: {axis}",
             f"displacements above the overlap: the contact of ids {ids[c]} and {ids[(c + 1) % n]} opened (stretched by {float(stretch[k, c]):.3g}, overlap {float(overlap[c]):.3g})",
         )

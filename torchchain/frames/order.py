@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.frames.doubts import here
 from torchchain.frames.record import AXES, Frame
 
 
-def line_axis(name: str, frame: Frame, axis: str | None) -> str | None:
+def line_axis(frame: Frame, axis: str | None) -> str | None:
     """The axis of the chain: the one given, or the one on which the particles form a line; None if they form none.
 
     They form one where none is farther from the first, across the axis, than half their mean distance along it.
@@ -18,9 +17,7 @@ def line_axis(name: str, frame: Frame, axis: str | None) -> str | None:
     if axis is not None:
         checks.choice("axis", axis, (*AXES, "all"))
         if axis != "all" and axis not in frame.axes:
-            raise checks.fail(
-                f"{here(name, frame)}: {axis}", "be in the file for this axis", f"only {', '.join(frame.axes)}"
-            )
+            raise checks.fail(frame.at(axis), "be in the file for this axis", f"only {', '.join(frame.axes)}")
         return None if axis == "all" else axis
     if len(frame.axes) == 1:
         return frame.axes[0]
@@ -40,7 +37,7 @@ def line_axis(name: str, frame: Frame, axis: str | None) -> str | None:
     return None
 
 
-def line_order(name: str, frame: Frame, axis: str) -> Tensor:
+def line_order(frame: Frame, axis: str) -> Tensor:
     """Places of the particles in ascending order along an axis, (particle,).
 
     On a periodic axis the order begins at the box's lower bound, unless the ids show where: if they ascend around
@@ -56,7 +53,7 @@ def line_order(name: str, frame: Frame, axis: str) -> Tensor:
     if len(same):
         a, b = order[int(same[0])], order[int(same[0]) + 1]
         raise checks.fail(
-            f"{here(name, frame)}: {axis}",
+            frame.at(axis),
             "differ from particle to particle along the chain",
             f"{along[a]:g} for ids {int(frame.ids[a])} and {int(frame.ids[b])}",
         )
@@ -65,7 +62,7 @@ def line_order(name: str, frame: Frame, axis: str) -> Tensor:
     return rolled if bool((rolled.diff() > 0).all()) else order
 
 
-def check_contact_order(name: str, frame: Frame, order: Tensor, axis: str) -> None:
+def check_contact_order(frame: Frame, order: Tensor, axis: str) -> None:
     """An error for a contact between particles that are not neighbors along the chain."""
     if frame.contacts is None:
         return
@@ -76,6 +73,4 @@ def check_contact_order(name: str, frame: Frame, order: Tensor, axis: str) -> No
     bad = (apart != 1) & (apart != len(order) - 1)
     if bool(bad.any()):
         a, b = (int(frame.ids[i]) for i in pairs[int(bad.nonzero()[0])])
-        raise checks.fail(
-            f"{here(name, frame)}: contacts", f"join neighbors along {axis} for a chain", f"one of ids {a} and {b}"
-        )
+        raise checks.fail(frame.at("contacts"), f"join neighbors along {axis} for a chain", f"one of ids {a} and {b}")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.frames.doubts import here, warn
+from torchchain.frames.doubts import warn
 from torchchain.frames.record import AXES, Frame
 from torchchain.frames.units import LAWS, at_rest, contact_stiffness, finite_masses, periods, separation
 from torchchain.network import Network, Packing, packing
@@ -17,21 +17,20 @@ from torchchain.network.packings import contact_law
 
 
 def network(
-    name: str, frame: Frame, reference: Frame, stiffness: float | str, contact: str, damping: float, prestress: bool
+    frame: Frame, reference: Frame, stiffness: float | str, contact: str, damping: float, prestress: bool
 ) -> Network:
     """The network of the contacts of grains; see :meth:`Frames.network`.
 
     Args:
-        name: of the file.
         frame: masses, ids, and radii and contacts where the state at rest has none.
         reference: the state at rest: positions and box.
         stiffness: a number as for :func:`torchchain.packing`, or "linear" or "hertz": from force and overlap in the list.
         contact, damping, prestress: as for :func:`torchchain.packing`.
     """
     if not torch.equal(frame.ids, reference.ids):
-        raise checks.fail(f"{here(name, reference)}: ids", f"be those of {here(name, frame)}", "others")
+        raise checks.fail(reference.at("ids"), f"be those of {frame.source}", "others")
     checks.choice("contact", contact, LAWS)
-    masses = finite_masses(name, frame)
+    masses = finite_masses(frame)
     found = [AXES.index(axis) for axis in reference.axes]
     sides = periods(reference.box)[found]
     box = sides if bool(sides.isfinite().any()) else None
@@ -42,10 +41,10 @@ def network(
     rested = replace(reference, masses=masses, radii=radii, contacts=at_rest(frame, reference, contact))
     if rested.contacts is None:
         if isinstance(stiffness, str):
-            contact_stiffness(name, rested, stiffness)  # an error: there is no list
+            contact_stiffness(rested, stiffness)  # an error: there is no list
         if radii is None:
             raise checks.fail(
-                f"{here(name, frame)}: radius",
+                frame.at("radius"),
                 "be in the file for a network of contacts, or contact lists with it (a chain: name its axis)",
                 "none",
             )
@@ -53,9 +52,9 @@ def network(
         try:
             return packing(reference.positions, radii, masses, box, modulus, contact, damping, prestress)
         except checks.FieldError as error:
-            raise checks.FieldError(f"{here(name, reference)}: {error}") from None
-    rested = _between_grains(name, rested)
-    force, slope = _laws(name, rested, stiffness, contact, prestress)
+            raise checks.FieldError(reference.at(str(error))) from None
+    rested = _between_grains(rested)
+    force, slope = _laws(rested, stiffness, contact, prestress)
     assert rested.contacts is not None
     fields: dict[str, Any] = {
         "masses": masses, "positions": reference.positions, "bonds": rested.contacts.pairs, "stiffness": slope,
@@ -66,35 +65,35 @@ def network(
             return Packing(**fields, radii=radii, contact=contact, modulus=float(stiffness))
         return Network(**fields)
     except checks.FieldError as error:
-        raise checks.FieldError(f"{here(name, reference)}: {error}") from None
+        raise checks.FieldError(reference.at(str(error))) from None
 
 
-def _between_grains(name: str, frame: Frame) -> Frame:
+def _between_grains(frame: Frame) -> Frame:
     """The frame with contacts between its particles only, and those that are closed."""
     contacts = frame.contacts
     assert contacts is not None
     walls = (contacts.pairs < 0).any(-1)
     if bool(walls.any()):
-        warn(f"{here(name, frame)}: contacts", f"{int(walls.sum())} with walls are left out, as a network has none")
+        warn(frame.at("contacts"), f"{int(walls.sum())} with walls are left out, as a network has none")
     pairs = contacts.pairs[~walls]
     overlap, force = (None if v is None else v[~walls] for v in (contacts.overlap, contacts.normal_force))
     if overlap is None and frame.radii is not None and len(pairs):
         overlap = frame.radii[pairs].sum(-1) - separation(frame, pairs)
     if overlap is not None and bool((overlap <= 0).any()):
         open_ones = overlap <= 0
-        warn(f"{here(name, frame)}: contacts", f"{int(open_ones.sum())} of {len(pairs)} are open and left out")
+        warn(frame.at("contacts"), f"{int(open_ones.sum())} of {len(pairs)} are open and left out")
         pairs, overlap, force = pairs[~open_ones], overlap[~open_ones], None if force is None else force[~open_ones]
     if not len(pairs):
-        raise checks.fail(f"{here(name, frame)}: contacts", "be at least one between two particles", "none")
+        raise checks.fail(frame.at("contacts"), "be at least one between two particles", "none")
     return replace(frame, contacts=replace(contacts, pairs=pairs, overlap=overlap, normal_force=force))
 
 
-def _laws(name: str, frame: Frame, stiffness: float | str, contact: str, prestress: bool) -> tuple[Tensor, Tensor]:
+def _laws(frame: Frame, stiffness: float | str, contact: str, prestress: bool) -> tuple[Tensor, Tensor]:
     """Force and its slope at every contact."""
     contacts = frame.contacts
     assert contacts is not None
     if isinstance(stiffness, str):
-        slope = contact_stiffness(name, frame, stiffness)
+        slope = contact_stiffness(frame, stiffness)
         assert contacts.normal_force is not None
         return contacts.normal_force, slope
     modulus = checks.number("stiffness", stiffness, above=0)
@@ -102,7 +101,7 @@ def _laws(name: str, frame: Frame, stiffness: float | str, contact: str, prestre
         return contact_law(contacts.overlap, contact, modulus)
     if prestress or contact == "hertz":
         raise checks.fail(
-            f"{here(name, frame)}: overlap",
+            frame.at("overlap"),
             "be in the contact list, or radii in the file, for contacts under pressure (or linear ones with prestress=False)",
             "none",
         )

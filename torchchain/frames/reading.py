@@ -18,7 +18,7 @@ from torchchain.chain.states import Trajectory
 from torchchain.frames import netcdf
 from torchchain.frames.building import build, kept, own_contacts
 from torchchain.frames.chains import chain as make_chain
-from torchchain.frames.doubts import check_energy, check_opening, here
+from torchchain.frames.doubts import check_energy, check_opening
 from torchchain.frames.motion import displacements
 from torchchain.frames.opening import File, Place, Source, find, time_of
 from torchchain.frames.packings import network as make_network
@@ -167,7 +167,7 @@ class Frames:
         found = []
         for frame in self:
             if frame.velocities is None:
-                raise checks.fail(f"{here(self.name, frame)}: velocities", "be in the file", "none")
+                raise checks.fail(frame.at("velocities"), "be in the file", "none")
             found.append(frame.velocities)
         return torch.stack(found)
 
@@ -210,7 +210,7 @@ class Frames:
                 its own, that of the first frame is carried over to it.
         """
         checks.choice("law", law, LAWS)
-        return fit_units(self.name, self._rested(reference, law), law)
+        return fit_units(self._rested(reference, law), law)
 
     # Chains
 
@@ -240,7 +240,7 @@ class Frames:
             FramesWarning: for a mean mass far from 1, and a box that is not periodic where the chain is.
         """
         frame = self._rested(reference, stiffness) if isinstance(stiffness, str) else self.first
-        return make_chain(self.name, frame, boundary, stiffness, axis, contact, damping)
+        return make_chain(frame, boundary, stiffness, axis, contact, damping)
 
     def trajectory(
         self, reference: Source | Frames | Frame | None = None, *, axis: str | None = None, chain: Chain | None = None
@@ -264,8 +264,8 @@ class Frames:
         Warns:
             FramesWarning: for displacements above the overlap, positions of too few digits, and motion across the chain.
         """
-        rest, name = self._reference(reference)
-        found = displacements(self.name, self, len(self), self.first, rest, name, axis, self._unit("length"))
+        rest = self._reference(reference)
+        found = displacements(self, len(self), self.first, rest, axis, self._unit("length"))
         if chain is not None:
             checks.instance("chain", chain, Chain)
             if isinstance(found, NetworkTrajectory) or chain.masses.shape != found.displacement.shape[-1:]:
@@ -307,19 +307,19 @@ class Frames:
         Warns:
             FramesWarning: for contacts with walls, and open ones, which are left out.
         """
-        rest, _ = self._reference(reference)
-        return make_network(self.name, self.first, rest, stiffness, contact, damping, prestress)
+        rest = self._reference(reference)
+        return make_network(self.first, rest, stiffness, contact, damping, prestress)
 
     def _rested(self, reference: Source | Frames | Frame | None, law: str) -> Frame:
         """The first frame with its contacts as they are at rest."""
-        rest, _ = self._reference(reference)
+        rest = self._reference(reference)
         return replace(self.first, contacts=at_rest(self.first, rest, law))
 
-    def _reference(self, reference: Source | Frames | Frame | None) -> tuple[Frame, str]:
+    def _reference(self, reference: Source | Frames | Frame | None) -> Frame:
         if reference is None:
-            return self.first, self.name
+            return self.first
         if isinstance(reference, Frame):
-            return reference, "reference"
+            return reference
         if not isinstance(reference, Frames):
             options = {name: value for name, value in self._options.items() if name == "periodic"}  # only where it is
             reference = Frames(*find(reference, None, None, options), self._scale, self._keep)
@@ -327,7 +327,7 @@ class Frames:
             raise checks.fail(
                 f"{reference.name}: frames", "be one for a reference (choose it: read_frames(path)[-1])", len(reference)
             )
-        return reference.first, reference.name
+        return reference.first
 
     # Reading
 
@@ -361,7 +361,7 @@ class Frames:
     def _view(self, frame: Frame, own: dict[str, np.ndarray] | None) -> Frame:
         """The frame as this view shows it: its particles, its units."""
         if own is not None:
-            frame = replace(frame, contacts=own_contacts(f"{self.name}, frame {frame.number}", own, len(frame.ids)))
+            frame = replace(frame, contacts=own_contacts(frame.source, own, len(frame.ids)))
         if self._keep is not None:
             frame = kept(frame, torch.searchsorted(frame.ids, self._keep))
         if self._scale is None:

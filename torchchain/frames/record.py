@@ -95,6 +95,7 @@ class Frame:
         masses, radii: (particle,), or None.
         box: or None.
         contacts: or None.
+        source: file and frame, as errors name them.
 
     Example:
         >>> from pathlib import Path
@@ -118,3 +119,8 @@ class Frame:
     radii: Tensor | None = None
     box: Box | None = None
     contacts: Contacts | None = None
+    source: str = "reference"
+
+    def at(self, field: str) -> str:
+        """Where it is from and a field, as errors and warnings begin."""
+        return f"{self.source}: {field}"

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.scaling import derived_units
-from torchchain.frames.doubts import here
 from torchchain.frames.record import AXES, Box, Contacts, Frame
 
 LAWS = ("linear", "hertz")
@@ -45,40 +44,40 @@ class ContactUnits:
         return known[checks.choice("quantity", quantity, known)]
 
 
-def finite_masses(name: str, frame: Frame) -> Tensor:
+def finite_masses(frame: Frame) -> Tensor:
     """The masses, (particle,); an error that says where they could come from if there are none."""
     if frame.masses is None:
         raise checks.fail(
-            f"{here(name, frame)}: masses",
+            frame.at("masses"),
             "be in the file (LAMMPS: the column mass; MercuryDPM: the .restart beside it) or be given by masses= or, with radii, density=", "none",
         )  # fmt: skip
     fixed = frame.masses.isinf()
     if bool(fixed.any()):
         raise checks.fail(
-            f"{here(name, frame)}: masses",
+            frame.at("masses"),
             "be finite (leave out fixed particles with frames.select)",
             f"a fixed particle, id {int(frame.ids[fixed][0])}",
         )
     return frame.masses
 
 
-def contact_stiffness(name: str, frame: Frame, law: str) -> Tensor:
+def contact_stiffness(frame: Frame, law: str) -> Tensor:
     """Slope of the force at each contact of the frame, (contact,): F / overlap, or (3/2) F / overlap of a Hertz contact."""
     checks.choice("law", law, LAWS)
     contacts = frame.contacts
     if contacts is None:
         raise checks.fail(
-            f"{here(name, frame)}: contacts",
+            frame.at("contacts"),
             "be read with the frames (read_frames(..., contacts=)) for their stiffness",
             "none",
         )
     for field in ("overlap", "normal_force"):
         values = getattr(contacts, field)
         if values is None:
-            raise checks.fail(f"{here(name, frame)}: {field}", "be in the contact list for its stiffness", "none")
+            raise checks.fail(frame.at(field), "be in the contact list for its stiffness", "none")
         if bool((values <= 0).any()):
             raise checks.fail(
-                f"{here(name, frame)}: {field}",
+                frame.at(field),
                 "be positive at every contact for its stiffness",
                 f"{float(values[values <= 0][0]):g}",
             )
@@ -121,14 +120,14 @@ def at_rest(frame: Frame, reference: Frame, law: str) -> Contacts | None:
     return replace(contacts, overlap=overlap, normal_force=force)
 
 
-def fit_units(name: str, frame: Frame, law: str) -> ContactUnits:
+def fit_units(frame: Frame, law: str) -> ContactUnits:
     """Units from the masses and contacts of a frame at rest; see :meth:`Frames.fit_units`."""
-    stiffness = contact_stiffness(name, frame, law)
-    masses = finite_masses(name, frame)
+    stiffness = contact_stiffness(frame, law)
+    masses = finite_masses(frame)
     assert frame.contacts is not None
     assert frame.contacts.overlap is not None
     if not len(stiffness):
-        raise checks.fail(f"{here(name, frame)}: contacts", "be at least one for units", "none")
+        raise checks.fail(frame.at("contacts"), "be at least one for units", "none")
     return ContactUnits(float(masses.mean()), float(stiffness.mean()), float(frame.contacts.overlap.mean()))
 
 
