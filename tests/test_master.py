@@ -159,6 +159,22 @@ def test_a_step_beyond_stability_is_refused(method):
         model.solve([1.0, 0.0], [0.0, 200.0], method, step=1.01 * limit)
 
 
+@pytest.mark.parametrize("method", [name for name in FIXED if name in ORDERS])
+def test_oscillations_that_decay_do_not_grow_by_the_steps_chosen(method):
+    # Two bands that swing at w = 2 and decay slowly: by the Euler rule, every step makes them larger by (w step)^2 / 2.
+    model = tc.MemoryModel(
+        rates=torch.zeros(2, 2, dtype=torch.float64), basis=torch.full((2, 2), 0.5, dtype=torch.float64),
+        decay=torch.zeros(0, dtype=torch.float64), pair_decay=torch.tensor([0.01], dtype=torch.float64),
+        pair_frequency=torch.tensor([2.0], dtype=torch.float64),
+        amplitudes=torch.tensor([[[0.5, -0.5], [-0.5, 0.5]], [[0.0, 0.0], [0.0, 0.0]]], dtype=torch.float64),
+    )  # fmt: skip
+    solved = tc.MasterEquation(model, None).solve([1.0, 0.0], np.linspace(0, 50, 101), method)
+    assert 0 <= float(solved.min()) <= float(solved.max()) <= 1.02
+    if method in ("euler", "midpoint", "heun2"):
+        with pytest.raises(FieldError, match=f"step must keep oscillations that decay from growing by '{method}'"):
+            tc.MasterEquation(model, None).solve([1.0, 0.0], [0.0, 3e3], method, step=0.5)
+
+
 def test_the_worst_member_of_a_batch_sets_the_step():
     # 200 members that stand still must not dilute the error of one that moves.
     model = master(conserving_rates(), np.zeros(B))

@@ -108,6 +108,7 @@ class CompactModel(TransferModel):
     }  # fmt: skip
     optional: ClassVar[tuple[str, ...]] = ("guide",)
     rates_meaning: ClassVar[str] = MemoryModel.rates_meaning
+    has_equation: ClassVar[bool] = False
 
     def __init__(
         self, rates: Tensor, degrees: Tensor, coefficients: Tensor, source_frequency: Tensor, source_decay: Tensor,

@@ -80,6 +80,7 @@ class TheoryModel(TransferModel):
         "contact_damping": (), "degrees": ("degree",), "coefficients": ("term",),
     }  # fmt: skip
     rates_meaning: ClassVar[str] = MemoryModel.rates_meaning
+    has_equation: ClassVar[bool] = False
 
     def __init__(
         self, law_values: Tensor, law_weights: Tensor, n_particles: Tensor, tones: Tensor, dual: Tensor,

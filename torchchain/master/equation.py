@@ -181,7 +181,8 @@ class MasterEquation(Printed, nn.Module):
             IntegrationError: if the solver fails, with its numbers.
 
         Warns:
-            PredictionWarning: for times beyond the model's horizon, for a band with a clearly negative energy, and for energy made.
+            PredictionWarning: for times beyond the model's horizon, for a band with a clearly negative energy, for energy made, and
+                for a model that obeys no differential equation, where one is solved or energy is supplied.
 
         Example:
             >>> import torch, torchchain as tc
@@ -213,12 +214,26 @@ class MasterEquation(Printed, nn.Module):
             energy = solver.run(self.model, initial, times, fed, **options)
         if not bool(energy.isfinite().all()):
             raise IntegrationError(f"solver '{method}' must stay finite, got overflow up to time {float(times[-1]):g}")
+        if energy.numel() and not self.model.has_equation and (fed is not None or method != "expm"):
+            off = "" if fed is not None else f", up to {self._off(initial, times, energy):.1e} of the energy away at these times"
+            warnings.warn(
+                f"the model '{self.model.kind}' obeys no differential equation: {'supply' if off == '' else repr(method)} takes "
+                f"the nearest model with memory{off}",
+                PredictionWarning,
+                stacklevel=2,
+            )
         self._warn(initial, times, fed, energy.detach())
         return energy
 
     def transfer(self, times: Any) -> Tensor:
         """T(t) [source, time, receiver]: :meth:`solve` from a unit energy in each band, with its errors and warnings."""
         return self.solve(torch.eye(self.n_bands).to(self.basis), times)
+
+    def _off(self, initial: Tensor, times: Tensor, energy: Tensor) -> float:
+        """Largest distance of energies from the model's own, of each start's total."""
+        with torch.no_grad():
+            off = (energy - self.model.propagate(initial, times)).abs().amax((-2, -1))
+            return float((off / initial.abs().sum(-1).clamp(min=torch.finfo(off.dtype).tiny)).max())
 
     def _start(self, initial: Any) -> StartEnergy | None:
         """A start in space; None for energies of bands."""

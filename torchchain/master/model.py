@@ -49,6 +49,7 @@ class TransferModel(nn.Module):
         axes: of each tensor that makes the model: "band", or any other word for an axis of any length.
         optional: those of them that a file may lack.
         rates_meaning: what :attr:`rates` are, in words.
+        has_equation: whether its energies are those of :meth:`embedding`, which else is the nearest linear equation to them.
 
     Example:
         >>> class Settling(tc.TransferModel):  # a model of your own: every band relaxes to its share in Pi at one rate
@@ -69,6 +70,7 @@ class TransferModel(nn.Module):
     axes: ClassVar[dict[str, tuple[str, ...]]]
     optional: ClassVar[tuple[str, ...]] = ()
     rates_meaning: ClassVar[str] = "slope of the model's transfer at time 0"
+    has_equation: ClassVar[bool] = True
     basis: Tensor
     damping: Tensor
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchchain import checks
@@ -17,6 +19,8 @@ from torchchain.odes import INTEGRATORS, IntegrationError, Integrator, member_no
 
 MOST_STEPS = 10**5
 """Steps from one output time to the next beyond which an adaptive method gives up; a fixed-step method, ten times that in all."""
+GROWTH = 0.01
+"""Largest exponent by which the steps chosen here make a mode grow that does not: the Euler rule makes every oscillation grow."""
 ADAMS_STEPS = 4
 ADAMS_ITERATIONS = 60
 
@@ -120,10 +124,14 @@ def _ode(integrator: Integrator) -> Callable[..., Tensor]:
 
 def _checked_step(integrator: Integrator, generator: Tensor, step: float | None, end: float) -> float:
     """The step to use, given or half the stability limit: stable, and not too many of them."""
-    fastest = float(torch.linalg.eigvals(generator.detach()).abs().max())
+    eigenvalues = torch.linalg.eigvals(generator.detach()).cpu().numpy()
+    fastest = float(np.abs(eigenvalues).max())
     edge, method = stability_limit(integrator), integrator.name
     limit = edge / fastest if fastest > 0 else float("inf")
-    step = min(limit / 2, 1.0) if step is None else checks.number("step", step, above=0)
+    given = None if step is None else checks.number("step", step, above=0)
+    step = min(limit / 2, 1.0) if given is None else given
+    while given is None and growth(integrator, eigenvalues, step, end) > GROWTH and end / step <= 10 * MOST_STEPS:
+        step /= 2
     if end / step > 10 * MOST_STEPS:
         raise checks.fail(
             "times", f"take at most {10 * MOST_STEPS} steps of {step:.3g} with '{method}' (expm has no steps)", end
@@ -134,7 +142,20 @@ def _checked_step(integrator: Integrator, generator: Tensor, step: float | None,
             f"be at most {limit:.6g} for '{method}' (|lambda| step <= {edge:.4g}, fastest rate {fastest:.4g})",
             step,
         )
+    if growth(integrator, eigenvalues, step, end) > 1:
+        raise checks.fail(
+            "step", f"keep oscillations that decay from growing by '{method}' up to time {end:g} (expm has no steps)", step
+        )
     return step
+
+
+def growth(integrator: Integrator, eigenvalues: NDArray[np.complex128], step: float, end: float) -> float:
+    """Largest exponent by which a mode that does not grow has grown at the end by steps of a Runge-Kutta method."""
+    if integrator.order is None or integrator.name.endswith("adams"):
+        return 0.0
+    z = eigenvalues[eigenvalues.real <= 1e-12 * np.abs(eigenvalues).max()] * step
+    factor = np.abs(sum(z**k / math.factorial(k) for k in range(integrator.order + 1)))
+    return float(np.log(factor.max(initial=1.0)) * end / step)
 
 
 def _solver(integrator: Integrator) -> Solver:
