@@ -149,6 +149,27 @@ def test_predict(run, calibrated):
     assert "2 starts, 3 times to 3, solved by expm" in output
 
 
+def test_a_folder_stands_for_its_model(run, calibrated):
+    assert tc.MasterEquation.load(calibrated).n_bands == 4
+    status, output, errors = run("plan", *SMALL[:-2], "--artifact", calibrated)
+    assert (status, errors) == (0, "")
+    assert "the master equation at hand" in output
+    status, output, _ = run("predict", calibrated, "--source", "2", "--times.stop", "3")
+    assert status == 0
+    assert "1 start, 13 times to 3" in output
+
+
+def test_a_folder_of_an_input_is_not_written_over(run):
+    assert run("calibrate", *SMALL, "--model", "memory", "--bootstrap", "0", "--out", "model")[0] == 0
+    before = open("model/run.json").read()
+    for command in (
+        ["predict", "model"], ["predict", "model/model.safetensors"], ["family", "model"], ["compare", "model", "model"],
+        ["calibrate", "--transfer", "model"],
+    ):  # fmt: skip
+        assert "out must be another folder than that of the input" in complains(run(*command, "--out", "./model"))
+    assert open("model/run.json").read() == before
+
+
 def test_predict_from_any_start_by_any_solver(run):
     # of a model that is a differential equation: others solve that of the nearest one with memory
     assert run("calibrate", *SMALL, "--realizations", "40", "--model", "memory", "--out", "memory")[0] == 0
@@ -451,6 +472,7 @@ PREDICT_FLAGS = [
     ("--initial 1 2", "initial must hold the 4 bands of the model, got 2 numbers"),
     ("--initial nan 0 0 0", "initial must be finite"),
     ("--initial x", "--initial must be"),
+    ("--initial 1 -1 0 0", "initial must not be negative, got -1 at band 2"),
     ("--initial 1 0 0 0 --source 1", "source must not be given together with initial"),
     ("--method magic", "method must be one of expm, "),
     ("--times.step 0", "times.step must be greater than 0"),

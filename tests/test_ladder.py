@@ -696,6 +696,7 @@ def test_families_from_the_command_line(family, tmp_path, capsys):
         assert (data.band_energy_stderr.values >= 0).all()
     for wrong, message in (
         ([model], "must carry the format torchchain-master-equation"),
+        ([model], "got torchchain-master-family, which takes a strength of the disorder (predict --strength"),
         ([model, "--strength", "0.5"], "strength must be at most 0.4"),
         ([files[0], "--strength", "0.1"], "must carry the format torchchain-master-family"),
     ):

@@ -211,6 +211,9 @@ def helped(command):
         ("simulate --n_bnds=4", "--n-bands"),
         ("calibrate --chains 5", "--realizations"),
         ("simulat", "simulate"),
+        ("simulate --width", "--observables width"),
+        ("sweep simulate xi=0.1,0.3", "disorder.strength"),
+        ("sweep simulate site=1,2", "excitation.site"),
         ("simulate --observables centre", "center"),
         ("simulate --method chebychev", "chebyshev"),
         ("simulate --boundary ring", "periodic"),
@@ -219,6 +222,19 @@ def helped(command):
 )
 def test_what_was_meant(arguments, word, capsys):
     assert complaint(capsys, *arguments.split()).endswith(f"; did you mean {word}?\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("plan --method modes", "Unrecognized options: --method, modes\n"),
+        ("frob --x 3", "error: frob is none of the commands simulate, calibrate,"),
+        ("compare a", "torchchain compare needs FILE|FOLDER the other\n"),
+        ("calibrate --observables width", "observables must be left out: a calibration measures the energies of bands"),
+    ],
+)
+def test_mistakes_are_one_phrase(arguments, words, capsys):
+    assert words in complaint(capsys, *arguments.split())
 
 
 def test_no_guess_where_nothing_is_near(capsys):

@@ -148,12 +148,12 @@ def device(field: str, value: Any) -> torch.device:
     return torch.device("cpu") if found.type == "cpu" else found
 
 
-def known_keys(field: str, given: Iterable[str], allowed: Iterable[str]) -> None:
-    """An error that names the first key that is not allowed."""
-    allowed = tuple(allowed)
+def known_keys(field: str, given: Iterable[str], allowed: Iterable[str], within: Iterable[str] = ()) -> None:
+    """An error that names the first key that is not allowed, and what of these, or of keys within them, may be meant."""
+    allowed, within = tuple(allowed), tuple(within)
     for key in given:
         if key not in allowed:
-            told = suggestion(key, allowed) if isinstance(key, str) else ""
+            told = suggestion(key, (*within, *allowed)) if isinstance(key, str) else ""
             raise fail(field, f"have only the keys {', '.join(allowed) or '(none)'}", repr(key) + told)
 
 

@@ -15,12 +15,12 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.scene_file import read_toml
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import MasterEquation, MasterFamily
+from torchchain.master.file import MODEL
 
 if TYPE_CHECKING:
     import xarray
 
 DATA = ("results.nc", "transfer.nc", "sweep.nc")
-MODEL = "model.safetensors"
 
 
 @dataclass(frozen=True)

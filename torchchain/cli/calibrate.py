@@ -52,6 +52,7 @@ def run_calibrate(
     if flags.transfer is not None:
         for name in {**config, **flags.overrides()}:
             raise checks.fail(name, "not be given together with transfer, which is of a scene already", repr(name))
+        outputs.check_apart(flags.out, flags.transfer)
         path, transfer = read_transfer(flags.transfer)
         transfer = transfer if starts else replace(transfer, starts=None)
         recipe(transfer, **settings)
@@ -60,6 +61,8 @@ def run_calibrate(
             source = {"transfer": {"path": str(path.resolve()), "sha256": outputs.sha256(path)}}
             _leave(run, transfer, settings, starts, None, source, shown)
         return
+    if flags.observables is not None:
+        raise checks.fail("observables", "be left out: a calibration measures the energies of bands", list(flags.observables))
     scene = scene_of(config, flags)
     asked = recipe(scene, **settings)  # before the ensemble is computed
     shown = sources_of(flags.show, scene.n_bands)

@@ -30,6 +30,7 @@ def run_compare(flags: Compare, arguments: list[str]) -> None:
     """Compare two results and leave the numbers and the figure."""
     began = time.time()
     checks.choice("format", flags.format, choices.FIGURES)
+    outputs.check_apart(flags.out, flags.a, flags.b)
     with outputs.run_folder(flags.out) as out, outputs.told_warnings() as warned:
         (a, first), (b, second) = (_read(name, path) for name, path in (("a", flags.a), ("b", flags.b)))
         found = compare(a, b)

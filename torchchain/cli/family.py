@@ -21,6 +21,7 @@ def run_family(flags: Family, arguments: list[str]) -> None:
     if not flags.models:
         raise checks.fail("models", "be at least one file", "none")
     paths = [model_file(path) for path in flags.models]
+    outputs.check_apart(flags.out, *paths)
     with outputs.run_folder(flags.out) as out:
         _join(paths, out, arguments, began)
 

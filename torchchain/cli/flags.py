@@ -230,8 +230,8 @@ class Family:
 class Plan(SceneFlags):
     """The cheapest way to meet a scene, with reasons and runners-up."""
 
-    artifact: Annotated[str | None, flag("FILE")] = None
-    """a model file of calibrate that could take the place of the chains"""
+    artifact: Annotated[str | None, flag("FILE|FOLDER")] = None
+    """a model file of calibrate, or the folder that holds it, that could take the place of the chains"""
 
 
 @dataclass(frozen=True)

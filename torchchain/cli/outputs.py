@@ -58,6 +58,14 @@ def run_folder(out: str | Path) -> Iterator[Path]:
         yield out
 
 
+def check_apart(out: str | Path, *inputs: str | Path) -> None:
+    """An error for an output folder that holds an input and the record of its run, which would be replaced."""
+    for path in map(Path, inputs):
+        folder = path if path.is_dir() else path.parent
+        if (folder / RECORD).is_file() and Path(out).resolve() == folder.resolve():
+            raise checks.fail("out", "be another folder than that of the input, whose record would be lost", str(out))
+
+
 def check_writable(out: str | Path) -> Path:
     """The output folder's path; an error now if nothing can be written there."""
     if not str(out).strip():

@@ -40,6 +40,7 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
     checks.choice("method", flags.method, SOLVERS)
     device = str(checks.device("device", flags.device))
     checks.choice("format", flags.format, choices.FIGURES)
+    outputs.check_apart(flags.out, flags.model)
     with outputs.run_folder(flags.out) as out, outputs.told_warnings() as warned:
         _predict(flags, given, loaded, out, device, arguments, began, warned)
 
@@ -65,7 +66,7 @@ def _predict(
     written = outputs.reported(
         out, arguments, text, device, began, stages.seconds, seed=flags.seed, method=flags.method, warnings=warned,
         model={"path": str(path.resolve()), "sha256": digest},
-        title=f"prediction of {len(labels)} starts to t = {float(times[-1]):g}",
+        title=f"prediction of {len(labels)} start{'s' * (len(labels) > 1)} to t = {float(times[-1]):g}",
         reasons=[f"solved by {flags.method}", *repr(master).splitlines()[1:]],
     )  # fmt: skip
     files = {
@@ -75,7 +76,7 @@ def _predict(
         **written,
     }
     outputs.write(out, files)
-    print(f"{len(labels)} starts, {len(times)} times to {float(times[-1]):g}, solved by {flags.method}")
+    print(f"{len(labels)} start{'s' * (len(labels) > 1)}, {len(times)} times to {float(times[-1]):g}, solved by {flags.method}")
     gone = starts.gone(master, times)
     print(
         f"largest change of total energy: {float((energy.sum(-1) + gone - starts.bands.sum(-1)[:, None]).abs().max()):.3g}"
@@ -139,6 +140,7 @@ def _starts(given: Mapping[str, Any], master: MasterEquation) -> tuple[Starts, l
         initial = checks.real_tensor("initial", given["initial"])
         if tuple(initial.shape) != (n_bands,):
             raise checks.fail("initial", f"hold the {n_bands} bands of the model", f"{initial.numel()} numbers")
+        checks.first_bad("initial", "not be negative", initial, initial < 0, "band")
         return Starts.of(initial[None], n_bands), ["initial"], {"initial": initial.tolist()}
     source = given.get("source", range(1, n_bands + 1))
     if isinstance(source, (str, Mapping, int)) or not len(source):

@@ -24,6 +24,12 @@ EXCITATIONS: dict[str, type[Impulse] | type[StandingWave]] = {"impulse": Impulse
 MOST_TIMES = 10**7
 TIMES = {"start": 0.0, "stop": 50.0, "step": 0.25}
 """Of a scene that names none, and what a table of times that a flag begins leaves out."""
+WITHIN = (
+    *(f"disorder.{entry.name}" for entry in dataclasses.fields(Disorder)),
+    *(f"excitation.{entry.name}" for kind in EXCITATIONS.values() for entry in dataclasses.fields(kind)),
+    *(f"times.{name}" for name in TIMES),
+)
+"""Fields of the tables of a scene file."""
 OF_LATTICES = {"shape": None, "motion": "vector", "removed_bonds": 0.0, "position_disorder": 0.0}
 """Fields that lattices alone have, with their defaults."""
 OF_MIXTURES = {"species": (), "arrangement": "random", "unlike": None, "by_species": False}
@@ -55,7 +61,7 @@ def dict_of(scene: Scene) -> dict[str, Any]:
 
 def fields_of(plain: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     """The fields of a scene from the plain values of a scene file, whose keys are among ``names``."""
-    checks.known_keys("scene", plain, names)
+    checks.known_keys("scene", plain, names, WITHIN)
     for name in ("n_particles", "n_bands"):
         if name in plain and plain[name] is None:
             raise checks.FieldTypeError(f"{name} must be an integer, got None")

@@ -29,6 +29,13 @@ from torchchain.master.uncertainty import LATER, Uncertainty
 
 FORMAT = "torchchain-master-equation"
 FAMILY_FORMAT = "torchchain-master-family"
+FORMATS = {
+    FORMAT: "which has one strength of the disorder and takes none",
+    FAMILY_FORMAT: "which takes a strength of the disorder (predict --strength, or MasterFamily.load(path).at(strength))",
+}
+"""What files of the two formats are to be told of where the other is wanted."""
+MODEL = "model.safetensors"
+"""What commands call such a file in a run's folder."""
 FORMAT_VERSION = 3
 CONVENTIONS = {
     "version": 1,  # of their meaning: wording may change without it
@@ -142,12 +149,12 @@ def _write(header: Mapping[str, Any], tensors: dict[str, torch.Tensor], path: st
 
 
 def load(path: str | Path) -> Member:
-    """Read and check a file written by :func:`save`."""
+    """Read and check a file written by :func:`save`, or that in a run's folder."""
     return _load(path, FORMAT)[0]
 
 
 def load_family(path: str | Path) -> list[Member]:
-    """Read and check a file written by :func:`save_family`."""
+    """Read and check a file written by :func:`save_family`, or that in a run's folder."""
     return _load(path, FAMILY_FORMAT)
 
 
@@ -156,9 +163,11 @@ def _load(path: str | Path, expected: str) -> list[Member]:
     path = Path(path)
     where = f"file {path}"
     try:
+        if path.is_dir() and (path / MODEL).is_file():
+            return _load(path / MODEL, expected)
         size = path.stat().st_size
         if not path.is_file():
-            raise checks.fail(where, "be a file", "a folder or device")
+            raise checks.fail(where, "be a file", "a folder or device" + f" (without {MODEL})" * path.is_dir())
         if size > LARGEST_FILE:
             raise checks.fail(where, f"be at most {LARGEST_FILE} bytes", size)
         with safe_open(path, framework="pt") as file:
@@ -207,7 +216,9 @@ def _headers(where: str, metadata: Mapping[str, str], expected: str) -> list[dic
         raise checks.fail(where, f"carry the format {expected}", "no such header")
     header = json.loads(metadata["torchchain"])
     if not isinstance(header, dict) or header.get("format") != expected:
-        raise checks.fail(where, f"carry the format {expected}", checks.shown(header))
+        other = header.get("format") if isinstance(header, dict) else header
+        told = FORMATS.get(other) if isinstance(other, str) else None
+        raise checks.fail(where, f"carry the format {expected}", f"{other}, {told}" if told else checks.shown(header))
     if expected == FORMAT:
         return [_header(where, header)]
     _check_version(where, header)

@@ -72,7 +72,7 @@ def plan(scene: Scene, artifact: str | Path | MasterEquation | None = None) -> P
 
     Args:
         scene: what is wanted.
-        artifact: a calibrated master equation, or the file of one, that could take the place of the chains.
+        artifact: a calibrated master equation, or its file or folder, that could take the place of the chains.
 
     Returns:
         Plan, whose ``str`` is the table that ``torchchain plan`` prints.
