@@ -208,6 +208,10 @@ def measure(config: Config, device: str) -> xarray.Dataset:
 
 
 def _measure(config: Config) -> xarray.Dataset:
+    for dtype in (torch.float64, torch.float32):  # load and compile what the methods use
+        chain, state = problem(WAVES[QUICK], torch.ones(WAVES[QUICK].n_particles, dtype=dtype))
+        for method in ("chebyshev", "verlet", "symplectic4"):
+            tc.evolve(chain, state, [1.0], method)
     entries: list[dict[str, Any]] = []
     errors = []
     for name in config.waves:
@@ -249,7 +253,7 @@ def _curve(
             except (EnergyDriftError, ode.IntegrationError, checks.FieldError):
                 continue  # a step or a tolerance that the method refuses
             if first > 2 * config.longest:
-                samples.append(first)  # far beyond what loading and compiling take: both are done by the coarser runs
+                samples.append(first)  # far beyond what loading takes, which is done by the coarser runs
             for _ in range(0 if samples else config.repeats if first < config.longest else 1):
                 began = time.process_time()
                 run()
@@ -304,8 +308,9 @@ def draw(data: xarray.Dataset, config: Config) -> Figure:
     for ax in axes[:, 0]:
         ax.set_ylabel("relative error (energy norm)")
     shown = [name for name in tc.METHODS if name in set(data.method.values)]
-    handles = [axes[0, 0].plot([], [], label=name, markersize=4, **_look(name))[0] for name in shown]
-    handles.append(axes[0, 0].plot([], [], "0.3", linestyle=":", label="float32")[0])
+    handles = [axes[0, 0].plot([], [], label=name, linestyle="-", markersize=4, **_look(name))[0] for name in shown]
+    hollow = {"linestyle": ":", "marker": "o", "markersize": 4, "markerfacecolor": "none"}
+    handles.append(axes[0, 0].plot([], [], "0.3", label="float32", **hollow)[0])
     handles.append(axes[0, 0].plot([], [], "k", linestyle="--", linewidth=0.8, label="reference's own error")[0])
     figure.legend(handles=handles, loc="outside lower center", ncols=3 if columns == 1 else 5)
     return figure

@@ -16,6 +16,7 @@ import tyro
 import xarray
 
 import torchchain as tc
+from torchchain.cli import outputs
 
 FOLDER = Path(__file__).resolve().parent
 Read = Callable[[Path], float]
@@ -31,6 +32,8 @@ class Flags:
     """seed of the ensembles"""
     out: str = "results/readme"
     """folder with a folder for each command"""
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    """take finished runs that it already holds, of whatever version"""
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for seed in range(flags.seed, flags.seed + number.seeds):
             if (number.command, seed) not in folders:
                 folder = Path(flags.out) / f"{number.command.split()[-1]}-{seed}"
-                folders[number.command, seed] = made(number.command, folder, seed)
+                finished = flags.resume and (folder / outputs.RECORD).is_file()
+                folders[number.command, seed] = folder if finished else made(number.command, folder, seed)
             values.append(number.read(folders[number.command, seed]))
         stated = number.said in readme
         good = stated and all(number.low <= value <= number.high for value in values)

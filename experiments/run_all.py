@@ -15,7 +15,7 @@ from pathlib import Path
 import tyro
 
 FOLDER = Path(__file__).resolve().parent
-NOT_EXPERIMENTS = ("binary_windows", "gradient_cases", "harness", "readme_numbers", "run_all", "speed_history")
+NOT_EXPERIMENTS = ("binary_windows", "gradient_cases", "harness", "readme_numbers", "run_all", "speed_against", "speed_history")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "experiments"))
 
+import speed_against
 import speed_history
 
 SMALL = ["--size", "0", "--repeats", "1"]
@@ -55,3 +56,24 @@ def test_files_of_the_project_are_of_this_kind(path):
     assert data["size"] == 1
     assert all(row["seconds"] > 0 and row["ratio"] > 0 for row in data["cases"].values())
     assert data["machine"]["torchchain"] in path.name
+
+
+@pytest.mark.parametrize("name", [name for name, _ in speed_against.cases(0)])
+def test_cases_that_two_versions_are_compared_by_run(name):
+    dict(speed_against.cases(0))[name]()()
+
+
+def test_two_versions_are_timed_in_turn_and_reported(tmp_path, capsys):
+    root = speed_history.ROOT.parent
+    words = [str(root), *SMALL, "--only", "kinetic energy, ring", "count of modes", "--out", str(tmp_path)]
+    speed_against.main(words)  # of a version against itself the status is chance
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in lines[1:3]] == ["kinetic energy, ring", "count of modes"]
+    assert all(float(number) > 0 for line in lines[1:3] for number in line.removesuffix(" SLOWER").split()[-3:])
+    assert (tmp_path / "report.txt").read_text().splitlines() == lines
+
+
+def test_a_version_without_what_is_asked_says_so(tmp_path, capsys):
+    (tmp_path / "torchchain.py").write_text("raise ImportError('an empty shell')")
+    speed_against.main([str(tmp_path), *SMALL, "--only", "kinetic energy, ring", "--out", str(tmp_path)])
+    assert "the process ended" in capsys.readouterr().out

@@ -13,7 +13,7 @@ from typing import Any
 from docutils import nodes
 from docutils.utils.math import latex2mathml
 
-HIDDEN = ("binary_windows", "gradient_cases", "harness", "readme_numbers", "run_all", "speed_history")
+HIDDEN = ("binary_windows", "gradient_cases", "harness", "readme_numbers", "run_all", "speed_against", "speed_history")
 PAPER = "fig"
 
 
