@@ -1,5 +1,7 @@
 """Observables of one's own go wherever the library's go."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -114,6 +116,18 @@ def test_an_observable_of_complex_numbers_is_named(monkeypatch):
     monkeypatch.setitem(OBSERVABLES, "wave", Observable("wave", ("time",), "1", "x", lambda *given: 1j * peak(*given)))
     with pytest.raises(FieldError, match="observable wave must give real numbers, got torch.complex128"):
         tc.simulate(scene(n_particles=16, excitation=tc.Impulse(8), observables=("wave",), realizations=1), "modes")
+
+
+def test_the_center_of_a_ring_that_energy_has_gone_round_is_remarked_upon():
+    kick = {"n_particles": 32, "realizations": 2, "observables": ("center", "width"), "excitation": tc.Impulse(16)}
+    with pytest.warns(tc.SeamWarning, match="center and width count the particles of a ring from 1 to 32, .* from time 15 on"):
+        found = tc.simulate(tc.Scene(**kick, times=[30.0]), "modes")
+    assert float(found["width"][0]) > 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", tc.SeamWarning)
+        tc.simulate(tc.Scene(**kick, times=[15.0]), "modes")
+        tc.simulate(tc.Scene(**kick, times=[30.0], boundary="fixed"), "modes")
+        tc.simulate(tc.Scene(**{**kick, "observables": ("energy",)}, times=[30.0]), "modes")
 
 
 def test_an_average_of_ones_own(monkeypatch):

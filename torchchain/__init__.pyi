@@ -40,6 +40,7 @@ from torchchain.ensemble import BandTransfer as BandTransfer
 from torchchain.ensemble import Observable as Observable
 from torchchain.ensemble import Provenance as Provenance
 from torchchain.ensemble import Scene as Scene
+from torchchain.ensemble import SeamWarning as SeamWarning
 from torchchain.ensemble import band_transfer as band_transfer
 from torchchain.ensemble import register_observable as register_observable
 from torchchain.ensemble import simulate as simulate

@@ -9,12 +9,13 @@ from torchchain.ensemble.observables import OBSERVABLES, Observable, register_ob
 from torchchain.ensemble.plan import Plan
 from torchchain.ensemble.provenance import Provenance
 from torchchain.ensemble.scene import Scene
-from torchchain.ensemble.simulation import simulate
+from torchchain.ensemble.simulation import SeamWarning, simulate
 from torchchain.ensemble.statistics import statistical_distance, total_variation
 from torchchain.ensemble.transfer import BandTransfer
 
 __all__ = [
     "OBSERVABLES", "BandTransfer", "Checkpoint", "CheckpointWarning", "Observable", "Plan", "Provenance", "Scene",
+    "SeamWarning",
     "band_transfer", "energy_moments", "estimate_disorder", "network_transfer", "register_observable", "simulate", "statistical_distance",
     "total_variation",
 ]  # fmt: skip

@@ -44,6 +44,7 @@ class Observable:
         average: in place of ``compute`` for what needs no times: ``(scene, chain, state, modes)`` to the same.
         local: whether particles at rest add nothing, so that they may be left out.
         is_place: whether the values count particles, from 1.
+        on_a_line: whether it takes means over particle numbers: of a ring only while energy stays away from its ends.
         wavenumbers: whether it is defined in wavenumber space: linear contacts alone.
         bands: whether it needs ``n_bands``.
         damped: whether damped chains have it.
@@ -67,6 +68,7 @@ class Observable:
     average: Callable[[Scene, Any, State, Any], Tensor] | None = None
     local: bool = False
     is_place: bool = False
+    on_a_line: bool = False
     wavenumbers: bool = False
     bands: bool = False
     damped: bool = True
@@ -212,7 +214,7 @@ for _one in (
     ),
     Observable(
         "center", ("time",), "particle", "center of energy R", lambda s, c, t: energy_center(_energy(s, c, t)),
-        local=True, is_place=True, passes=18, kernel="center", kinds=CHAINS,
+        local=True, is_place=True, on_a_line=True, passes=18, kernel="center", kinds=CHAINS,
     ),
     Observable(
         "displacement", ("time", "particle"), "initial overlap", "displacement", lambda s, c, t: t.displacement,
@@ -263,7 +265,7 @@ for _one in (
     ),
     Observable(
         "width", ("time",), "particle^2", "mean squared width r^2", lambda s, c, t: energy_width(_energy(s, c, t)),
-        local=True, passes=22, kernel="width", kinds=CHAINS,
+        local=True, on_a_line=True, passes=22, kernel="width", kinds=CHAINS,
     ),
 ):  # fmt: skip
     register_observable(_one)

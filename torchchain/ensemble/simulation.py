@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from torchchain.chain.excitation import Impulse
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.checkpoint import Checkpoint
 from torchchain.ensemble.labels import coordinates, ordered_error, scene_attributes
@@ -20,6 +22,20 @@ from torchchain.threads import single_thread
 
 if TYPE_CHECKING:
     import xarray
+
+
+class SeamWarning(UserWarning):
+    """A center or width of energy on a ring that it has gone round: particle N lies beside particle 1.
+
+    Example:
+        >>> import warnings
+        >>> with warnings.catch_warnings(record=True) as told:
+        ...     warnings.simplefilter("always")
+        ...     ring = tc.Scene(n_particles=16, excitation=tc.Impulse(3), times=[9.0], realizations=2, observables=("width",))
+        ...     _ = tc.simulate(ring, "modes")
+        >>> [warning.category.__name__ for warning in told]
+        ['SeamWarning']
+    """
 
 
 def simulate(
@@ -48,6 +64,9 @@ def simulate(
         band), coordinates counted from 1, units in the attributes; realized mass moments in the attributes.
         A single realization of a disordered chain has the standard error infinity.
 
+    Warns:
+        SeamWarning: for the center or width of a kick's energy on a ring, once it reaches particle 1 or N.
+
     Example:
         >>> scene = tc.Scene(n_particles=64, boundary="fixed", excitation=tc.Impulse(site=1), times=[0.0, 10.0, 20.0],
         ...                  observables=("center", "width"), realizations=10)
@@ -58,6 +77,8 @@ def simulate(
         'particle'
     """
     scene = planning.resolved(scene)
+    if not ranks.rank:
+        _warn_at_seam(scene)
     ensemble = ensemble_moments(
         scene, method, device=device, memory_budget=memory_budget, progress=progress, stages=stages, options=options,
         checkpoint=checkpoint, ranks=ranks,
@@ -65,6 +86,20 @@ def simulate(
     with single_thread():
         found = {name: merged(ensemble.moments.blocks(name)) for name in scene.observables}
         return _dataset(scene, found, ensemble.attributes)
+
+
+def _warn_at_seam(scene: Scene) -> None:
+    """A :class:`SeamWarning` where a kick's energy, at the speed of sound, reaches the ends of a ring within the times."""
+    names = [entry.name for entry in chosen_observables(scene.observables) if entry.on_a_line]
+    away = min(scene.site - 1, scene.n_particles - scene.site)
+    if names and scene.boundary == "periodic" and isinstance(scene.excitation, Impulse) and float(scene.times[-1]) > away:
+        warnings.warn(
+            f"{' and '.join(names)} count{'s' * (len(names) == 1)} the particles of a ring from 1 to {scene.n_particles}, though "
+            f"these two are neighbors: the energy of a kick at {scene.site} passes between them from time {away} on (boundary 'fixed', "
+            "a site farther from both or earlier times keep it away)",
+            SeamWarning,
+            stacklevel=3,
+        )
 
 
 def _dataset(scene: Scene, moments: dict[str, Moments], attributes: dict[str, Any]) -> xarray.Dataset:
