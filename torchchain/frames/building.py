@@ -75,6 +75,8 @@ def build(place: Place, raw: Raw, contacts: Raw | None, first: Frame | None, opt
     frame = replace(
         frame, ids=first.ids, masses=first.masses, radii=first.radii if frame.radii is None else frame.radii
     )
+    if contacts is None and raw.contacts is not None and place.contact_file is None:
+        frame = replace(frame, contacts=own_contacts(frame, raw.contacts))
     if contacts is not None:
         assert place.contact_file is not None
         assert place.contact_entry is not None
@@ -232,11 +234,12 @@ def contacts_of(at: str, columns: dict[str, np.ndarray], frame: Frame, name: str
     return Contacts(torch.from_numpy(pairs), overlap, rest.get("normal_force"))
 
 
-def own_contacts(at: str, found: dict[str, np.ndarray], n: int) -> Contacts:
+def own_contacts(frame: Frame, found: dict[str, np.ndarray]) -> Contacts:
     """Contacts of a netCDF file, whose pairs are places already."""
     pairs = torch.from_numpy(np.ascontiguousarray(found["pairs"], dtype=np.int64))
+    n = len(frame.ids)
     if bool(((pairs < -1) | (pairs >= n)).any()):
-        raise checks.fail(f"{at}: contact_pair", f"be places from 0 to {n - 1}, or -1", f"{int(pairs.max())}")
+        raise checks.fail(frame.at("contact_pair"), f"be places from 0 to {n - 1}, or -1", f"{int(pairs.max())}")
     rest = [
         torch.from_numpy(np.ascontiguousarray(found[field], dtype=np.float64)) if field in found else None
         for field in ("overlap", "normal_force")

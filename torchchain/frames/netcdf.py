@@ -202,6 +202,7 @@ def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iter
         block = max(1, BLOCK // max(1, 8 * n * d))
         flags = file["periodic"][...].tolist() if "periodic" in file else None
         held: dict[str, np.ndarray] = {}
+        of_frame = file["contact_frame"][...] if "contact_frame" in file else None
         begin = -block
         for entry in entries:
             if not begin <= entry.offset < begin + block:
@@ -228,22 +229,13 @@ def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iter
             if flags is not None:
                 (xl, yl, zl), (xh, yh, zh) = held["box_lower"][at].tolist(), held["box_upper"][at].tolist()
                 box = Box((xl, yl, zl), (xh, yh, zh), (bool(flags[0]), bool(flags[1]), bool(flags[2])))
-            yield Raw(found, box, going)
-
-
-def read_contacts(path: Path, entries: Iterable[Entry]) -> Iterator[dict[str, np.ndarray] | None]:
-    """Places and what else there is of the contacts of each frame, None if the file has no contacts."""
-    with _open(path) as file:
-        if "contact_frame" not in file:
-            for _ in entries:
-                yield None
-            return
-        of_frame = file["contact_frame"][...]
-        for entry in entries:
-            low, high = np.searchsorted(of_frame, [entry.offset, entry.offset + 1])
-            yield {"pairs": file["contact_pair"][low:high]} | {
-                name: file[f"contact_{name}"][low:high] for name in CONTACT if f"contact_{name}" in file
-            }
+            contacts = None
+            if of_frame is not None:
+                low, high = np.searchsorted(of_frame, [entry.offset, entry.offset + 1])
+                contacts = {"pairs": file["contact_pair"][low:high]} | {
+                    name: file[f"contact_{name}"][low:high] for name in CONTACT if f"contact_{name}" in file
+                }
+            yield Raw(found, box, going, contacts)
 
 
 FORMAT = Format(

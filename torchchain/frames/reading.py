@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
-from torchchain.frames import netcdf
-from torchchain.frames.building import build, kept, own_contacts
+from torchchain.frames.building import build, kept
 from torchchain.frames.chains import chain as make_chain
 from torchchain.frames.doubts import check_energy, check_opening
 from torchchain.frames.motion import displacements
@@ -335,38 +333,22 @@ class Frames:
         return 1.0 if self._scale is None else float(self._scale.unit(quantity))
 
     def _read_first(self) -> Frame:
-        return build(self._places[0], next(self._raws(self._places[:1])), None, None, self._options)
+        place = self._places[0]
+        return build(place, next(self._raws([(place.file, place.entry)])), None, None, self._options)
 
-    def _raws(self, places: Iterable[Place]) -> Iterator[Raw]:
-        """The frames as their files have them; each file is opened once for consecutive frames."""
-        for file, group in _groups([(place.file, place.entry) for place in places]):
+    def _raws(self, pairs: Sequence[tuple[Any, Any]]) -> Iterator[Raw]:
+        """The numbers of files and entries in them; each file is opened once for consecutive entries."""
+        for file, group in _groups(pairs):
             yield from file.format.read(file.path, group, self._options)
 
     def _frames(self, places: Sequence[Place]) -> Iterator[Frame]:
-        listed = [
-            (place.contact_file, place.contact_entry) for place in places if place.contact_file and place.contact_entry
-        ]
-        contacts = (raw for file, group in _groups(listed) for raw in file.format.read(file.path, group, self._options))
-        own: Iterator[Any] = iter(())
-        if places[0].file.format is netcdf.FORMAT and places[0].contact_file is None:
-            own = (
-                found
-                for file, group in _groups([(place.file, place.entry) for place in places])
-                for found in netcdf.read_contacts(file.path, group)
-            )
-        for place, raw in zip(places, self._raws(places), strict=True):
+        contacts = self._raws([(place.contact_file, place.contact_entry) for place in places if place.contact_entry])
+        for place, raw in zip(places, self._raws([(place.file, place.entry) for place in places]), strict=True):
             joined = next(contacts) if place.contact_entry is not None else None
-            yield self._view(build(place, raw, joined, self._origin, self._options), next(own, None))
-
-    def _view(self, frame: Frame, own: dict[str, np.ndarray] | None) -> Frame:
-        """The frame as this view shows it: its particles, its units."""
-        if own is not None:
-            frame = replace(frame, contacts=own_contacts(frame.source, own, len(frame.ids)))
-        if self._keep is not None:
-            frame = kept(frame, torch.searchsorted(frame.ids, self._keep))
-        if self._scale is None:
-            return frame
-        return scaled_frame(frame, self._scale)
+            frame = build(place, raw, joined, self._origin, self._options)
+            if self._keep is not None:
+                frame = kept(frame, torch.searchsorted(frame.ids, self._keep))
+            yield frame if self._scale is None else scaled_frame(frame, self._scale)
 
 
 def _groups(pairs: Sequence[tuple[Any, Any]]) -> Iterator[tuple[File, list[Entry]]]:

@@ -31,11 +31,13 @@ class Raw:
     """The numbers of one frame as its file has them, in the order of its rows.
 
     ``columns`` has the names id, type, mass, radius, x, y, z, vx, vy, vz; of contacts id1, id2, overlap, normal_force.
+    ``contacts`` has those that stand beside the particles: pairs of their places, overlap, normal_force.
     """
 
     columns: dict[str, np.ndarray]
     box: Box | None = None
     unwrapped: frozenset[str] = frozenset()
+    contacts: dict[str, np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
