@@ -9,6 +9,7 @@ the bonds gives two moments.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,20 +88,24 @@ def spectral_moments(network: Network, starts: Tensor, n_moments: int) -> tuple[
     return moments, top
 
 
+def _doubled(products: Iterator[tuple[Any, Any]]) -> list[Any]:
+    """Moments from the products <T_k f, T_k f> and <T_k f, T_k+1 f> for k = 0, 1, ..., by T_j T_k = (T_j+k + T_|j-k|) / 2."""
+    zeroth, first = next(products)
+    return [zeroth, first] + [part for a, b in products for part in (2 * a - zeroth, 2 * b - first)]
+
+
 def _plain_moments(network: Network, fields: Tensor, n_moments: int, top: float) -> Tensor:
     masses = network.masses[:, None]
     weight = 4 / top**2 / masses
 
-    def product(a: Tensor, b: Tensor) -> Tensor:
-        return (masses * a * b).sum((-2, -1))
+    def products() -> Iterator[tuple[Tensor, Tensor]]:
+        old, new = fields, fields + weight / 2 * network.force(fields)
+        for k in range(n_moments // 2):
+            if k:
+                old, new = new, 2 * new - old + weight * network.force(new)
+            yield (masses * old * old).sum((-2, -1)), (masses * old * new).sum((-2, -1))
 
-    older, old = fields, fields + weight / 2 * network.force(fields)
-    moments = [product(fields, fields), product(fields, old)]
-    zeroth, first = moments
-    for _ in range(1, n_moments // 2):
-        older, old = old, 2 * old - older + weight * network.force(old)
-        moments += [2 * product(older, older) - zeroth, 2 * product(old, older) - first]
-    return torch.stack(moments, dim=-1)
+    return torch.stack(_doubled(products()), dim=-1)
 
 
 def _compiled_moments(network: Network, field: Tensor, n_moments: int, top: float) -> Tensor:
@@ -111,18 +116,15 @@ def _compiled_moments(network: Network, field: Tensor, n_moments: int, top: floa
     if cells.ndim == 4:  # rows of a lattice, with copies of their ends
         masses[..., 0] = masses[..., -1] = 0.0
     table = np.zeros((0, n_moments, 2, 1))
-    moments = []
-    for k in range(1, n_moments // 2 + 1):
-        run((k, k + 1), n_moments, 0, layout.parts, cells, sums, table)
-        new, now = cells[k % 2], cells[(k + 1) % 2]
-        weighted = masses * now
-        same, next_ = float(np.vdot(weighted, now)), float(np.vdot(weighted, new))
-        if k == 1:
-            zeroth, first = same, next_
-            moments += [same, next_]
-        else:
-            moments += [2 * same - zeroth, 2 * next_ - first]
-    return torch.tensor(moments, dtype=torch.float64)
+
+    def products() -> Iterator[tuple[float, float]]:
+        for k in range(1, n_moments // 2 + 1):
+            run((k, k + 1), n_moments, 0, layout.parts, cells, sums, table)
+            new, now = cells[k % 2], cells[(k + 1) % 2]
+            weighted = masses * now
+            yield float(np.vdot(weighted, now)), float(np.vdot(weighted, new))
+
+    return torch.tensor(_doubled(products()), dtype=torch.float64)
 
 
 def density_from_moments(moments: Tensor, top: float, frequencies: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ from torchchain.theory.ladder import (
     window_of,
 )
 from torchchain.theory.law import Law
-from torchchain.theory.medium import coherent_mass, site_resolvent
+from torchchain.theory.medium import site_resolvent
 
 LAST = 48.0
 """Time up to which the correction is computed."""
@@ -139,10 +139,8 @@ def _cosines(wavenumbers: Tensor, count: int) -> Tensor:
 
 def _side(law: Law, waves: Waves, stretch: Stretch) -> tuple[_Side, list[Tensor]]:
     """The resolvent on the whole line, and the sources' mean amplitudes with plus and minus their change."""
-    z, loss, inner = line(waves, stretch)
+    z, loss, inner, mass, argument = line(law, waves, stretch)
     squared = inner.square()
-    mass, _ = coherent_mass(inner, law, waves.ring)
-    argument = squared * mass
     g = site_resolvent(argument, waves.ring)
     count = min(_FARTHEST, (waves.n_particles - 1) // 2) + 1
     cosines = _cosines(waves.around, count)

@@ -179,9 +179,7 @@ def ladder_transfer(law: Law, waves: Waves, times: Tensor, edges: tuple[float, f
 
 def _one_stretch(law: Law, waves: Waves, times: Tensor, stretch: Stretch) -> Tensor:
     points = stretch.points
-    z, loss, inner = line(waves, stretch)
-    mass, _ = coherent_mass(inner, law, waves.ring)
-    argument = inner.square() * mass
+    z, loss, inner, mass, argument = line(law, waves, stretch)
     g = site_resolvent(argument, waves.ring)
     received = waves.received(argument)
     source = 1 / (waves.sources[:, None] - argument)
@@ -245,13 +243,15 @@ def together(*tensors: Tensor) -> list[Tensor]:
     ]
 
 
-def line(waves: Waves, stretch: Stretch) -> tuple[Tensor, Tensor, Tensor]:
+def line(law: Law, waves: Waves, stretch: Stretch) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Frequencies (i + 1/2) step + i eta, (frequency,), those with a negative real part being mirror images; 1 - i damping
-    z, by which contact damping multiplies K; and the frequency that the chain without damping sees."""
+    z, by which contact damping multiplies K; the frequency that the chain without damping sees; the medium's mu and e there."""
     right = (torch.arange(stretch.points, dtype=torch.float64) + 0.5) * stretch.step
     z = torch.complex(right, torch.full_like(right, stretch.eta))
     loss = 1 - 1j * waves.damping * z
-    return z, loss, z / loss.sqrt()
+    inner = z / loss.sqrt()
+    mass, _ = coherent_mass(inner, law, waves.ring)
+    return z, loss, inner, mass, inner.square() * mass
 
 
 def source_scale(law: Law, waves: Waves) -> Tensor:

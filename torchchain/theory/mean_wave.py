@@ -145,9 +145,8 @@ def _stretch(start: float, stop: float, edge: float) -> Stretch:
 
 
 def _energies(law: Law, waves: Waves, times: Tensor, stretch: Stretch, highest: float) -> tuple[Tensor, Tensor]:
-    z, loss, inner = line(waves, stretch)
-    mass, _ = coherent_mass(inner, law, waves.ring)
-    ring = 1 / (waves.sources[:, None] - inner.square() * mass)
+    z, loss, inner, _, argument = line(law, waves, stretch)
+    ring = 1 / (waves.sources[:, None] - argument)
     below = int((z.real < highest).sum())
     orders = _ORDERS if stretch.start > 0 else _EARLY_ORDERS
     found = [mean_resolvent(some, law, waves.wavenumbers, orders) for some in inner[:below].split(_BLOCK)]
