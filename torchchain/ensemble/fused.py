@@ -77,9 +77,9 @@ def energy_moments(chain: Chain, state: State, times: Any, definition: str = "si
             here = energy.particle_energy(chain, advance(window), definition)
             parts.append(torch.stack([here.sum(-1), energy.energy_center(here), energy.energy_width(here)]))
         return EnergyMoments(*torch.cat(parts, dim=-1))
-    from torchchain.evolvers import stencil
+    from torchchain.evolvers import records, stencil
 
-    kind = stencil.SITE_MOMENTS if definition == "site" else stencil.BOND_MOMENTS
+    kind = records.SITE_MOMENTS if definition == "site" else records.BOND_MOMENTS
     advance.check_work(times)
     rows_in_time, steps = stencil.Propagation(advance.rows, mirrored=True, once=True), times.double().numpy()
     out = np.empty((advance.rows.count, len(steps), 3))
@@ -129,11 +129,11 @@ def band_energy(
             ],
             dim=-2,
         )
-    from torchchain.evolvers import stencil
+    from torchchain.evolvers import records
 
-    kind, count, strain = stencil.BOND_FIELDS, 2, np.zeros(chain.n_particles // 2 + 1)
+    kind, count, strain = records.BOND_FIELDS, 2, np.zeros(chain.n_particles // 2 + 1)
     if definition == "site":
-        kind, count = (stencil.UNIFORM_FIELDS, 3) if chain.is_uniform_ring else (stencil.SITE_FIELDS, 4)
+        kind, count = (records.UNIFORM_FIELDS, 3) if chain.is_uniform_ring else (records.SITE_FIELDS, 4)
         strain = _strain(chain)
     (bands,) = _binned(advance, state, times, n_bands, normalize, kind, count, [(kind, strain)])
     return bands
@@ -164,12 +164,12 @@ def both_band_energies(
         ]
         released, struck = (torch.cat(part, dim=-2) for part in zip(*parts, strict=True))
         return released, struck
-    from torchchain.evolvers import stencil
+    from torchchain.evolvers import records
 
     strain = _strain(chain)
     softness = np.divide(1.0, strain, out=np.zeros_like(strain), where=strain > 0)
-    wanted = [(stencil.UNIFORM_FIELDS, strain), (stencil.KICKED_FIELDS, softness)]
-    released, struck = _binned(advance, state, times, n_bands, True, stencil.KICKED_FIELDS, 4, wanted)
+    wanted = [(records.UNIFORM_FIELDS, strain), (records.KICKED_FIELDS, softness)]
+    released, struck = _binned(advance, state, times, n_bands, True, records.KICKED_FIELDS, 4, wanted)
     return released, struck
 
 
@@ -192,6 +192,7 @@ def _binned(
         wanted: kinds of energy with their strain, as :func:`torchchain.evolvers.spectra.bin_spectra` takes them.
     """
     from torchchain.evolvers import stencil
+    from torchchain.evolvers.spectra import bin_spectra
 
     advance.check_work(times)
     steps, rows = times.double().numpy(), advance.rows
@@ -216,7 +217,7 @@ def _binned(
                 rows_in_time.fields(low, high, steps[first:last], kind, fields.numpy(), low)
                 spectra = torch.fft.rfft(fields).numpy().view(np.float64)
                 for (what, _), strain, found, total in zip(wanted, strains, bands, totals, strict=True):
-                    stencil.bin_spectra(spectra, what, strain, normalize, low, first, found, total)
+                    bin_spectra(spectra, what, strain, normalize, low, first, found, total)
                 del spectra  # so that the next lie where these do, in cache
 
     workers = min(torch.get_num_threads(), rows.count)

@@ -48,5 +48,7 @@ def start(chain: Chain, state: State, method: str, **options: Any) -> Advance:
         raise checks.fail("contact", f"be {' or '.join(entry.contacts)} for method '{method}'", repr(chain.contact))
     traced = (chain.masses, chain.contact_stiffness, chain.contact_damping, state.displacement, state.velocity)
     if not entry.traced and any(checks.is_transformed(values) for values in traced):
-        raise checks.fail("method", "be 'modes' or 'chebyshev' under torch.func (backward() goes through others)", method)
+        raise checks.fail(
+            "method", "be 'modes' or 'chebyshev' under torch.func (backward() goes through others)", method
+        )
     return entry.start(chain, state, **options)

@@ -244,14 +244,14 @@ class CompiledAdvance:
         check_work(times, float(self.rows.frequencies.max()))
 
     def __call__(self, times: Tensor) -> Trajectory:
-        from torchchain.evolvers import stencil
+        from torchchain.evolvers import records
 
         self.check_work(times)
         later = later_times(times, self._now)
         out = torch.empty((2, self.rows.count, len(later), self._n), dtype=self._dtype)
         steps, states = later.numpy(), out.numpy()
         side_by_side(
-            lambda begin, end: self._propagation.fields(begin, end, steps, stencil.STATES, states), self.rows.count
+            lambda begin, end: self._propagation.fields(begin, end, steps, records.STATES, states), self.rows.count
         )
         self._now = later[-1].item()
         displacement, velocity = out.reshape(2, *self._shape, len(later), self._n)

@@ -14,7 +14,7 @@ def bin_spectra(spectra, kind, strain, normalize, row, time, bands, totals):
     """Energies of wavenumbers (Eq. 43) summed into bands (Eq. 44).
 
     Args:
-        spectra: transforms of the fields that :func:`propagate` leaves, without a factor, (field, row, time,
+        spectra: transforms of the fields that :func:`.stencil.propagate` leaves, without a factor, (field, row, time,
             2 (N/2 + 1)): the real and the imaginary part of each wavenumber in turn.
         kind: UNIFORM_FIELDS, SITE_FIELDS or BOND_FIELDS; KICKED_FIELDS for the motion after a kick, of which these are the
             fields of the motion after a release (see :mod:`torchchain.energy.kicked`).

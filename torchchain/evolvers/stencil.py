@@ -5,12 +5,8 @@ A state at time t is a sum of Chebyshev polynomials T_k(x) of x = 1 - 2 A / W^2,
 
     u(t) = sum_k [c_k T_k u + s_k T_k v],    v(t) = sum_k [c_k T_k v + d_k T_k u],
 
-with z = W (t - anchor) and
-
-    c_k = 2 J_2k(z),    s_k = (4 / W) (J_2k+1 + J_2k+3 + ...)(z),    d_k = W (J_2k-1 - J_2k+1)(z),
-
-c_0 and s_0 being half of that and d_0 = -W J_1. The outputs that follow an anchor closely form one *segment* and
-share its T_k; the last of them is the next anchor.
+with the coefficients of :mod:`.coefficients` at z = W (t - anchor). The outputs that follow an anchor closely form one
+*segment* and share its T_k; the last of them is the next anchor.
 
 On a uniform time grid the states mirrored about an anchor are at hand too, and then one recursion does for both:
 
@@ -34,25 +30,8 @@ from torchchain.evolvers import kernels
 from torchchain.evolvers.coefficients import Tables, tabulate, top_order
 from torchchain.evolvers.compiling import kernel
 from torchchain.evolvers.expansion import LEAP, LONGEST, SHARED_PHASE
-from torchchain.evolvers.records import (
-    BOND_FIELDS,
-    BOND_MOMENTS,
-    KICKED_FIELDS,
-    SITE_FIELDS,
-    SITE_MOMENTS,
-    STATES,
-    UNIFORM_FIELDS,
-    mean_by_mass,
-    record_fields,
-    record_moments,
-)
+from torchchain.evolvers.records import BOND_MOMENTS, SITE_MOMENTS, mean_by_mass, record_fields, record_moments
 from torchchain.evolvers.recursion import PAD, RING, Row, advance, aligned, clear, close, lay_out, trim, twice_energy
-from torchchain.evolvers.spectra import bin_spectra
-
-__all__ = [
-    "BOND_FIELDS", "BOND_MOMENTS", "KICKED_FIELDS", "SITE_FIELDS", "SITE_MOMENTS", "STATES", "UNIFORM_FIELDS", "Propagation",
-    "Rows", "bin_spectra", "propagate",
-]  # fmt: skip
 
 # The mirrored form adds up rounding errors like a random walk's integral; a plain step now and then ends that.
 RESTART = 64
@@ -77,14 +56,8 @@ def propagate(
 
     Args:
         begin, end: rows; row r is start r % starts of realization r // starts.
-        masses: (realization, particle).
-        contacts: stiffness of contacts 0 to N, (realization, N + 1); on a ring the last is the first.
-        rigid_masses: mass that moves as a whole, infinite between walls, (realization,).
-        frequencies: W, no less than any frequency of the chain, (realization,).
-        starts: rows per realization.
-        periodic: whether the chains are rings.
+        masses, contacts, rigid_masses, frequencies, starts, periodic, tolerance: see :class:`Rows`.
         times: (time,), increasing, not before the clock.
-        tolerance: largest sum of dropped coefficients in a segment.
         mirrored: use the states mirrored about an anchor where the times form a uniform grid, and take times that
             are equal within rounding as equal. Without it the states do not depend on how the times are cut into
             calls, to the last bit.
@@ -226,9 +199,9 @@ class Rows:
 
     Attributes:
         masses: (realization, particle), float64.
-        contacts: (realization, N + 1), float64; on a ring the last contact is the first again.
+        contacts: stiffness of contacts 0 to N, (realization, N + 1), float64; on a ring the last is the first again.
         rigid_masses: mass that moves as a whole, infinite between walls, (realization,), float64.
-        frequencies: W, (realization,), float64.
+        frequencies: W, no less than any frequency of the chain, (realization,), float64.
         states: displacement and velocity, (row, 2, particle), float64; row r starts realization r // starts.
         starts: rows per realization.
         periodic: whether the chains are rings.
