@@ -6,7 +6,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, partial
 from typing import Generic, TypeVar, overload
@@ -19,6 +19,8 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 _waiting: list[threading.Event] = []
 """Works of :func:`meanwhile` that have not been told to begin."""
+_waiting_for_core: list[threading.Event] = []
+"""The same of :func:`beside`."""
 
 
 class kept_property(Generic[Owner, Result]):
@@ -76,20 +78,46 @@ def _libraries(scipy: bool) -> ThreadpoolController:
 
 @contextmanager
 def beside(work: Callable[[], Result], workers: int) -> Iterator[Callable[[], Result]]:
-    """Do other work meanwhile, on a thread of one core; gives how to wait for its result.
+    """Do other work on a thread of one core, as soon as :func:`core_free` says that there is one; gives how to wait for its result.
 
-    With one worker it is done when the result is asked for.
+    What nobody has said so for by then begins when its result is asked for, and with one worker is done there.
     """
     if workers <= 1:
         yield work
         return
+    begin, wanted = threading.Event(), True
+
+    def alone() -> Result:
+        begin.wait()
+        if not wanted:
+            raise CancelledError
+        return work()
+
     pool = ThreadPoolExecutor(1, thread_name_prefix="torchchain", initializer=partial(torch.set_num_threads, 1))
+    future = pool.submit(alone)
+
+    def result() -> Result:
+        begin.set()
+        return future.result()
+
+    _waiting_for_core.append(begin)
     try:
-        yield pool.submit(work).result
+        yield result
     except BaseException:  # nobody wants what is under way
+        wanted = False
+        begin.set()
         pool.shutdown(wait=False, cancel_futures=True)
         raise
+    finally:
+        _waiting_for_core.remove(begin)
+    begin.set()
     pool.shutdown()
+
+
+def core_free() -> None:
+    """Begin what waits for it in :func:`beside`: from here on one thread works where there were several."""
+    for begin in _waiting_for_core:
+        begin.set()
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from torchchain.master.selection import select
 from torchchain.master.starts import can_fit, fit_starts, with_errors
 from torchchain.master.uncertainty import draw_again, horizon
 from torchchain.progress import bar
-from torchchain.threads import beside, single_blas_thread
+from torchchain.threads import beside, core_free, single_blas_thread
 
 LINEAR_WINDOW = (0.5, 2.0)
 REPLICATES = 20
@@ -173,6 +173,7 @@ def calibrate(
         if not asked.complete:
             asked, selection, near, spare = select(transfer, asked, shown.update, threads)
             report = replace(report, selection=selection)
+        core_free()
         sample = Sample.of(transfer)
         fitted, told = asked.run(sample, near, shown.update)
         free, proof = fitted, None
