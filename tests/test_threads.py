@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from torchchain.threads import kept_property, map_in_order, meanwhile
+from torchchain.threads import beside, core_free, kept_property, map_in_order, meanwhile
 
 
 def test_kept_properties_of_two_objects_are_computed_at_once():
@@ -52,6 +52,41 @@ def test_other_work_is_not_done_where_nothing_is_mapped_or_something_fails():
         raise ZeroDivisionError
     with meanwhile(lambda: seen.append("unwanted"), 1):
         list(map_in_order(abs, range(4), 2))
+    assert not [
+        thread
+        for thread in threading.enumerate()
+        if thread.name.startswith("torchchain") and not thread.join(20) and thread.is_alive()
+    ]
+    assert seen == []
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_work_beside_begins_with_a_free_core_or_when_its_result_is_asked_for(workers):
+    begun = threading.Event()
+
+    def work():
+        begun.set()
+        return threading.current_thread().name
+
+    with beside(work, workers) as found:
+        assert not begun.wait(0.05)
+        core_free()
+        assert begun.wait(20) or workers == 1
+        assert found().startswith("torchchain") == (workers == 2)
+    begun.clear()
+    with beside(work, workers, at_once=True) as found:
+        assert begun.wait(20) or workers == 1
+    begun.clear()
+    with beside(work, workers) as found:
+        found()
+    assert begun.is_set()
+
+
+def test_work_beside_what_fails_is_not_begun():
+    seen = []
+    with pytest.raises(ZeroDivisionError), beside(lambda: seen.append("unwanted"), 2):
+        raise ZeroDivisionError
+    core_free()  # nothing waits any more
     assert not [
         thread
         for thread in threading.enumerate()

@@ -77,10 +77,10 @@ def _libraries(scipy: bool) -> ThreadpoolController:
 
 
 @contextmanager
-def beside(work: Callable[[], Result], workers: int) -> Iterator[Callable[[], Result]]:
-    """Do other work on a thread of one core, as soon as :func:`core_free` says that there is one; gives how to wait for its result.
+def beside(work: Callable[[], Result], workers: int, at_once: bool = False) -> Iterator[Callable[[], Result]]:
+    """Do other work on a thread of one core, at once or as soon as :func:`core_free` is called; gives how to wait for its result.
 
-    What nobody has said so for by then begins when its result is asked for, and with one worker is done there.
+    It begins when its result is asked for at the latest, and with one worker is done there.
     """
     if workers <= 1:
         yield work
@@ -100,6 +100,8 @@ def beside(work: Callable[[], Result], workers: int) -> Iterator[Callable[[], Re
         begin.set()
         return future.result()
 
+    if at_once:
+        begin.set()
     _waiting_for_core.append(begin)
     try:
         yield result

@@ -102,7 +102,7 @@ def _leave(
     run: Run, transfer: BandTransfer, settings: dict[str, Any], starts: bool, forecast: dict[str, Any] | None,
     source: dict[str, Any], shown: Sequence[int],
 ) -> None:  # fmt: skip
-    """Fit, predict, compare, draw, write and tell; the data are written while the model is fitted."""
+    """Fit, predict, compare, draw, write and tell; the data are written where the fit leaves a core."""
     stages = run.stages
     with outputs.staging(run.out) as aside, beside(partial(_save, transfer, aside), torch.get_num_threads()) as saved:
         with warnings.catch_warnings(record=True) as caught:

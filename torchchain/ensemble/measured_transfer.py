@@ -108,7 +108,7 @@ def band_transfer(
     if not starts or not measurable(scene):
         return measured()
     other = None if checkpoint is None else Checkpoint(checkpoint.folder / "starts", checkpoint.every)
-    with beside(measured, torch.get_num_threads()) as found:
+    with beside(measured, torch.get_num_threads(), at_once=True) as found:
         moved = start_transfer(scene, ensemble.method, ensemble.options, other, **settings)
     return replace(found(), starts=moved)
 
