@@ -68,9 +68,8 @@ def start(chain: Chain, state: State) -> Advance:
         phase.check(times, w, w.dtype)
         z = propagate(times.to(matrix)).reshape(*initial.shape[:-2], len(times), 2 * n_modes)
         energy = z.square().sum(-1) / 2
-        bad = ~(energy.detach() <= slack * initial_energy.detach())
-        if bool(bad.any()):
-            where = tuple(int(i) for i in bad.nonzero()[0])
+        where = checks.first(~(energy.detach() <= slack * initial_energy.detach()))
+        if where is not None:
             raise PropagationError(
                 f"a damped chain must not gain energy, got {energy[where].item():.6g} from "
                 f"{initial_energy[where[:-1]].item():.6g} at time {times[where[-1]].item():g}{checks.position(where[:-1])}"

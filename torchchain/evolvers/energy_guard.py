@@ -33,10 +33,9 @@ def check(chain: Chain, trajectory: Trajectory, initial: Tensor, allowed: Tensor
         if trajectory.dissipated is not None:
             energy = energy + trajectory.dissipated
         change = (energy - initial[..., None]).abs()
-        bad = ~(change <= (allowed * initial)[..., None])
-        if not bool(bad.any()):
+        where = checks.first(~(change <= (allowed * initial)[..., None]))
+        if where is None:
             return
-        where = tuple(int(i) for i in bad.nonzero()[0])
         raise EnergyDriftError(
             f"energy must stay within {allowed[where[:-1]].item():.2g} of its initial {initial[where[:-1]].item():.4g}, got "
             f"{energy[where].item():.4g} at time {trajectory.times[where[-1]].item():g}"

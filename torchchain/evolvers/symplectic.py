@@ -119,11 +119,10 @@ def check_limits(step: float, method: str, rates: Sequence[tuple[str, float | No
     for name, limit, rate in rates:
         largest = rate.amax().item()
         if limit is not None and not step * largest < limit:
-            where = tuple(int(i) for i in (rate == largest).nonzero()[0])
             raise checks.fail(
                 "step",
                 f"be less than {limit / largest:.6g}, the stability limit {limit:.6g} / {name} of method '{method}' "
-                f"with {name} = {largest:.6g}{checks.position(where)}",
+                f"with {name} = {largest:.6g}{checks.position(checks.first(rate == largest) or ())}",
                 step,
             )
 

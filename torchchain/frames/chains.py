@@ -40,8 +40,7 @@ def chain(frame: Frame, boundary: str, stiffness: Any, axis: str | None, contact
             f"their mean is {mean:.4g}, not 1: times are in other units than the library's (frames.scaled, or import --units mass, gives those)",
         )
     checks.choice("boundary", boundary, ("periodic", "fixed"))
-    periodic = frame.box is not None and frame.box.period(line) > 0
-    if boundary == "periodic" and frame.box is not None and not periodic:
+    if boundary == "periodic" and frame.box is not None and not frame.period(line):
         warn(frame.at("box"), f"not marked periodic along {line}, but the chain is to be")
     if isinstance(stiffness, str):
         stiffness = _from_contacts(frame, stiffness, order, boundary)

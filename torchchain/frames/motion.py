@@ -12,7 +12,7 @@ from torchchain.chain.states import Trajectory
 from torchchain.frames.building import check_properties
 from torchchain.frames.doubts import check_across, check_bounds, check_digits, warn
 from torchchain.frames.order import check_contact_order, line_axis, line_order
-from torchchain.frames.record import AXES, TIMED, Box, Frame
+from torchchain.frames.record import AXES, TIMED, Frame
 from torchchain.memory import gigabytes, memory
 from torchchain.network import NetworkTrajectory
 
@@ -45,8 +45,7 @@ def displacements(
     times = torch.empty(n_frames, dtype=torch.float64)
     rest = reference.positions[order][:, columns]
     wraps = [
-        _period(reference.box, first.axes[c]) if not (first.unwrapped[c] and reference.unwrapped[c]) else 0.0
-        for c in columns
+        reference.period(first.axes[c]) if not (first.unwrapped[c] and reference.unwrapped[c]) else 0.0 for c in columns
     ]
     before = torch.zeros_like(rest)
     last, sources, crossed = first, [], set[int]()
@@ -58,11 +57,7 @@ def displacements(
                 "none",
             )
         if frame.time is None:
-            raise checks.fail(
-                frame.at("TIME"),
-                TIMED,
-                "none",
-            )
+            raise checks.fail(frame.at("TIME"), TIMED, "none")
         u = frame.positions[order][:, columns] - rest
         for i, (column, side) in enumerate(zip(columns, wraps, strict=True)):
             if side:
@@ -86,10 +81,6 @@ def displacements(
     return NetworkTrajectory(times - times[0], moved, velocity)
 
 
-def _period(box: Box | None, axis: str) -> float:
-    return 0.0 if box is None else box.period(axis)
-
-
 def _check_alike(first: Frame, reference: Frame) -> None:
     """An error unless the reference has the same particles and axes."""
     if reference.axes != first.axes:
@@ -103,7 +94,7 @@ def _check_alike(first: Frame, reference: Frame) -> None:
 
 
 def _check_box(frame: Frame, reference: Frame, axis: str) -> None:
-    now, then = _period(frame.box, axis), _period(reference.box, axis)
+    now, then = frame.period(axis), reference.period(axis)
     if abs(now - then) > 1e-6 * then:
         raise checks.fail(
             frame.at("box"),
@@ -136,7 +127,7 @@ def _check_line(sources: list[str], moved: Tensor, first: Frame, reference: Fram
         axis: of the chain.
     """
     rest, ids = reference.positions[order, first.axes.index(axis)], first.ids[order].tolist()
-    period = _period(reference.box, axis)
+    period = reference.period(axis)
     n = len(order)
     gap, stretch = rest.diff(), moved.diff(dim=-1)
     if period:

@@ -22,12 +22,10 @@ def line_axis(frame: Frame, axis: str | None) -> str | None:
     if len(frame.axes) == 1:
         return frame.axes[0]
     offset = frame.positions - frame.positions[:1]
-    if frame.box is not None:
-        for i, a in enumerate(frame.axes):
-            length = frame.box.period(a)
-            if length > 0:
-                across = offset[:, i]
-                offset[:, i] = across - length * (across / length).round()
+    for i, a in enumerate(frame.axes):
+        length = frame.period(a)
+        if length > 0:
+            offset[:, i] -= length * (offset[:, i] / length).round()
     for i, a in enumerate(frame.axes):
         along = frame.positions[:, i]
         spacing = float(along.max() - along.min()) / max(1, len(along) - 1)

@@ -124,3 +124,7 @@ class Frame:
     def at(self, field: str) -> str:
         """Where it is from and a field, as errors and warnings begin."""
         return f"{self.source}: {field}"
+
+    def period(self, axis: str) -> float:
+        """See :meth:`Box.period`; 0 without a box."""
+        return self.box.period(axis) if self.box is not None else 0.0

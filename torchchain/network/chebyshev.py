@@ -1,9 +1,7 @@
 """Chebyshev propagation of networks: exact to rounding, by products with the bonds alone.
 
 The expansion of a chain (:mod:`torchchain.evolvers.chebyshev`, whose coefficients serve here) needs nothing of the
-chain but its force and a bound W^2 that no squared frequency exceeds:
-
-    u(t) = sum_k [c_k T_k u + s_k T_k v],    v(t) = sum_k [c_k T_k v + d_k T_k u],    T_k = T_k(1 - 2 M^-1 K / W^2).
+chain but its force and a bound W^2 that no squared frequency exceeds: T_k = T_k(1 - 2 M^-1 K / W^2).
 
 On the CPU the kernels of :mod:`torchchain.network.kernels` do it, in float64; elsewhere, and where gradients are asked
 for, plain torch. Outputs that follow a state closely share one recursion.

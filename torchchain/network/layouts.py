@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import scipy
@@ -24,26 +24,11 @@ Run = Callable[..., None]
 """Called with steps, last, begin, end, cells, sums, table, see :func:`torchchain.network.kernels.gathered`."""
 
 
-class Layout(Protocol):
-    """Numbers of one network laid out for a kernel, which treats ``parts`` pieces of it one by one."""
-
-    parts: int
-
-    def cells(self, fields: list[np.ndarray]) -> np.ndarray:
-        """Scratch with T_0 in it, from fields (particle, component)."""
-
-    def sums(self, outputs: int) -> np.ndarray:
-        """Zeros for the sums."""
-
-    def bind(self, member: int, frequency: float) -> Run:
-        """The kernel with the numbers of a member of the batch."""
-
-    def read(self, sums: np.ndarray) -> np.ndarray:
-        """The sums as (output, 2, particle, component)."""
-
-
 class Gathered:
-    """Neighbors listed for every particle; particles renumbered so that neighbors are near each other in memory."""
+    """Neighbors listed for every particle; particles renumbered so that neighbors are near each other in memory.
+
+    The kernel treats ``parts`` pieces of the network one by one.
+    """
 
     def __init__(self, network: Network) -> None:
         n, c = network.n_particles, network.n_components
@@ -93,15 +78,18 @@ class Gathered:
         return self._offsets[columns]
 
     def cells(self, fields: list[np.ndarray]) -> np.ndarray:
+        """Scratch with T_0 in it, from fields (particle, component)."""
         cells = np.zeros((2, self.n + 1, len(fields) * self.components))
         for r, values in enumerate(fields):
             cells[0, :-1, r * self.components : (r + 1) * self.components] = values[self.order]
         return cells
 
     def sums(self, outputs: int) -> np.ndarray:
+        """Zeros for the sums."""
         return np.zeros((outputs, 2, self.n, self.components))
 
     def bind(self, member: int, frequency: float) -> Run:
+        """The kernel with the numbers of a member of the batch."""
         from torchchain.network import kernels  # imports Numba
 
         weight = 4 / frequency**2 / self.masses[member]
@@ -124,13 +112,14 @@ class Gathered:
         return _bound(kernel, scratch, weight, stiff, directions, across)
 
     def read(self, sums: np.ndarray) -> np.ndarray:
+        """The sums as (output, 2, particle, component)."""
         out = np.empty_like(sums)
         out[:, :, self.order] = sums
         return out
 
 
 class Rows:
-    """Rows of a lattice, whose neighbors are rows."""
+    """Rows of a lattice, whose neighbors are rows; with the methods of :class:`Gathered`."""
 
     def __init__(self, network: Lattice) -> None:
         *front, self.width = network.shape
@@ -226,7 +215,7 @@ def _bound(kernel: Callable[[np.ndarray], Any], scratch: Callable[[np.ndarray], 
     return run
 
 
-def layout_of(network: Network) -> Layout:
+def layout_of(network: Network) -> Gathered | Rows:
     """The fastest layout that the network has."""
     wide = isinstance(network, Lattice) and network.n_bonds > 0 and network.shape[-1] >= NARROW
     return Rows(network) if wide and _is_straight(network) else Gathered(network)  # type: ignore[arg-type]

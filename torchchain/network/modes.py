@@ -120,13 +120,12 @@ def normal_modes(network: Network) -> NetworkModes:
     refined = (network.bond_force(elongation) * elongation).sum((-2, -1))
     eps = torch.finfo(squared.dtype).eps
     limit = 4 * n * c * eps * squared.detach().abs().amax(-1, keepdim=True)
-    slipped = ((refined - squared).detach().abs() > limit).any(-1)
-    if bool(slipped.any()):
-        where = tuple(int(i) for i in slipped.nonzero()[0])
+    where = checks.first(((refined - squared).detach().abs() > limit).any(-1))
+    if where is not None:
         raise RuntimeError(f"the eigen-solver's modes must satisfy their equation, got others{checks.position(where)}")
     lowest = refined.detach().amin(-1)
-    if bool((lowest < -limit[..., 0]).any()):
-        where = tuple(int(i) for i in (lowest < -limit[..., 0]).nonzero()[0])
+    where = checks.first(lowest < -limit[..., 0])
+    if where is not None:
         raise _unstable(lowest[where].item(), int((refined[where] < -limit[where]).sum()), where)
     zero = refined.detach() <= limit
     refined = torch.where(zero, 1.0, refined).sqrt()
@@ -134,7 +133,9 @@ def normal_modes(network: Network) -> NetworkModes:
     frequencies, order = frequencies.sort(dim=-1)
     shapes = shapes.gather(-1, order[..., None, None, :].expand(shapes.shape))
     modes = NetworkModes(frequencies, shapes)
-    _warn_if_floppy(network, int(modes.n_zero.max()))
+    zero_modes = int(modes.n_zero.max())
+    if zero_modes > rigid_motions(network):
+        warnings.warn(f"the network has {describe_softness(network, zero_modes)}", FloppyWarning, stacklevel=3)
     return modes
 
 
@@ -143,12 +144,6 @@ def _unstable(squared: float, count: int | None, where: tuple[int, ...] = ()) ->
     return UnstableError(
         f"tension must leave every squared frequency positive or zero, got {squared:.6g}{several}{checks.position(where)}"
     )
-
-
-def _warn_if_floppy(network: Network, zero_modes: int) -> None:
-    if zero_modes > rigid_motions(network):
-        soft = describe_softness(network, zero_modes)
-        warnings.warn(f"the network has {soft}", FloppyWarning, stacklevel=4)
 
 
 def softness(network: Network) -> Softness:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -220,16 +221,15 @@ def subnetwork(network: Network, keep: Tensor) -> Network:
         raise checks.fail("keep", f"be truth values of shape ({n},)", f"{keep.dtype}, shape {tuple(keep.shape)}")
     all_keep = torch.cat([keep, torch.ones(network.n_anchors, dtype=torch.bool, device=device)])
     number = all_keep.cumsum(0) - 1
-    kept = network.with_bonds(all_keep[network.bonds].all(-1))
+    kept: Any = network.with_bonds(all_keep[network.bonds].all(-1))
     fields: dict[str, Any] = {
         "masses": network.masses[..., keep],
         "positions": network.positions[keep],
         "bonds": number[kept.bonds],
     }
-    common: dict[str, Any] = {
-        name: getattr(kept, name) for name in ("stiffness", "tension", "damping", "images", "box", "motion", "anchors")
-    }
     if isinstance(network, Packing):
-        extra: dict[str, Any] = {"radii": network.radii[keep], "contact": network.contact, "modulus": network.modulus}
-        return Packing(**fields, **common, **extra)
-    return Network(**fields, **common)
+        return replace(kept, **fields, radii=network.radii[keep])
+    # Of a lattice what is left is none.
+    return Network(
+        **{each.name: getattr(kept, each.name) for each in dataclasses.fields(Network) if each.init} | fields
+    )

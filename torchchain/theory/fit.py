@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import scipy
-from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import Disorder
@@ -113,11 +112,10 @@ def fit_disorder(
             replace(disorder, strength=strength), n_particles, n_bands, times, found, damping=max(damping, 0.0)
         )
         # Spread a distance of total variation over the bands: half of it is the source's own.
-        error = result.systematic[..., None] * (1.0 if curve else 2.0 / n_bands)
-        value: Tensor = result.mean[0, :, band] if curve else result.mean
-        return value.numpy().ravel(), error.expand_as(result.mean)[..., 0].numpy().ravel() if curve else (
-            error.expand_as(result.mean).numpy().ravel()
-        )
+        if curve:
+            return result.mean[0, :, band].numpy(), result.systematic[0].numpy()
+        error = result.systematic[..., None] * (2.0 / n_bands)
+        return result.mean.numpy().ravel(), error.expand_as(result.mean).numpy().ravel()
 
     def model(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return at(*parameters.tolist())
