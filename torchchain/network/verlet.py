@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain import State
-from torchchain.evolvers.method import Advance, Method
+from torchchain.evolvers.method import Advance, Method, targets_of
+from torchchain.evolvers.symplectic import check_limits, substeps
 from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network
 from torchchain.network.packings import Packing, contact_law, near_pairs
@@ -31,15 +32,11 @@ def start(network: Network, state: State, step: float | None = None, linear: boo
     if linear is False and not grains:
         raise checks.fail("linear", "be True or None for a network that is no packing", linear)
     with torch.no_grad():
-        top = network.squared_frequency_bound().sqrt().amax().item()
-    rate = _damping_rate(network)
+        top, rate = network.squared_frequency_bound().sqrt(), _damping_rate(network)
     if step is None:
-        step = DEFAULT / max(top, rate, 1e-300)
+        step = DEFAULT / max(top.amax().item(), rate.amax().item(), 1e-300)
     step = checks.number("step", step, above=0)
-    if step * top >= 2 or step * rate >= 2:
-        raise checks.fail(
-            "step", f"be less than {2 / max(top, rate):.6g}, the stability limit of method 'verlet'", step
-        )
+    check_limits(step, "verlet", [("W", 2.0, top), ("d_max", 2.0, rate)])
     if grains:
         assert isinstance(network, Packing)
         return _grains(network, state, step)
@@ -47,20 +44,19 @@ def start(network: Network, state: State, step: float | None = None, linear: boo
     return _linear(network, state, step)
 
 
-def _damping_rate(network: Network) -> float:
-    """A bound on the eigenvalues of M^-1 D."""
-    with torch.no_grad():
-        if not network.is_damped:
-            return 0.0
-        ends = network.bond_damping
-        total = ends.new_zeros(*network.batch_shape, network.n_particles + network.n_anchors)
-        total = total.index_add(-1, network.bonds[:, 0], ends).index_add(-1, network.bonds[:, 1], ends)
-        return (2 * total[..., : network.n_particles] / network.masses).amax().item()
+def _damping_rate(network: Network) -> Tensor:
+    """A bound on the eigenvalues of M^-1 D, (*batch,)."""
+    ends, (i, j) = network.bond_damping, network.bonds.unbind(-1)
+    total = ends.new_zeros(*network.batch_shape, network.n_particles + network.n_anchors)
+    total = total.index_add(-1, i, ends).index_add(-1, j, ends)
+    return (2 * total[..., : network.n_particles] / network.masses).amax(-1)
 
 
-def _steps(interval: float, step: float) -> tuple[int, float]:
-    count = math.ceil(interval / step * (1 - 1e-12))
-    return count, interval / max(count, 1)
+def _steps(times: Tensor, now: float, step: float) -> Iterator[tuple[float, int, float]]:
+    """Each time with the number and the length of the steps that lead to it, from ``now`` on."""
+    targets = targets_of(times, now)
+    for t, before, count in zip(targets, [now, *targets], substeps(now, targets, step).tolist(), strict=False):
+        yield t, count, (t - before) / max(count, 1)
 
 
 def _linear(network: Network, state: State, step: float) -> Advance:
@@ -76,8 +72,7 @@ def _linear(network: Network, state: State, step: float) -> Advance:
     def advance(times: Tensor) -> NetworkTrajectory:
         nonlocal u, v, force, now
         outputs = []
-        for t in times.tolist():
-            count, h = _steps(t - now, step)
+        for t, count, h in _steps(times, now, step):
             for _ in range(count):
                 v = drag(v, h / 2) if damped else v
                 v = v + h / 2 * force
@@ -145,8 +140,7 @@ def _grains(network: Packing, state: State, step: float) -> Advance:
     def advance(times: Tensor) -> NetworkTrajectory:
         nonlocal now
         out = torch.empty((2, len(rows), len(times), *shape[-2:]), dtype=dtype)
-        for k, t in enumerate(times.tolist()):
-            count, h = _steps(t - now, step)
+        for k, (t, count, h) in enumerate(_steps(times, now, step)):
             for row, (x, v) in enumerate(rows):
                 left = count
                 while left:
