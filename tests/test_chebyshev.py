@@ -306,7 +306,13 @@ def test_bessel_functions_left_out(z):
 @pytest.mark.parametrize("n", [2, 3, 48])
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 def test_default_bounds(boundary, n):
+    from torchchain.evolvers import stencil
+
     chain = a_chain(boundary, n=n, strength=0.5)
+    contacts = torch.cat([chain.contact_stiffness, chain.contact_stiffness[:, :1]], dim=-1).numpy()
+    bounds = np.empty(3)
+    stencil.squared_bounds(0, 3, chain.masses.numpy(), contacts, boundary == "periodic", 8, bounds)
+    assert bounds == pytest.approx(chain.squared_frequency_bound(8).numpy(), rel=1e-14)
     top = tc.normal_modes(chain).frequencies[:, -1]
     assert (start(chain, a_start("random", chain), "chebyshev").rows.frequencies >= top.numpy()).all()
     assert (chebyshev.highest_frequency(chain) >= top).all()

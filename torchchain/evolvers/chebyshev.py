@@ -60,10 +60,10 @@ def start(
     """
     tensors = (chain.masses, chain.contact_stiffness, state.displacement, state.velocity)
     tolerance, compiled = settled(accuracy, compiled, tensors)
-    frequency = highest_frequency(chain, bound)
     if compiled:
+        frequency = None if bound is None else highest_frequency(chain, bound)
         return CompiledAdvance(chain, state, frequency, tolerance)
-    return expanded(chain, state, frequency, tolerance, Trajectory)
+    return expanded(chain, state, highest_frequency(chain, bound), tolerance, Trajectory)
 
 
 def settled(accuracy: float, compiled: bool | None, tensors: Iterable[Tensor]) -> tuple[float, bool]:
@@ -210,7 +210,7 @@ def later_times(times: Tensor, now: float) -> Tensor:
 class CompiledAdvance:
     """The expansion by the kernels of :mod:`stencil`, in float64 whatever the dtype of the state."""
 
-    def __init__(self, chain: Chain, state: State, frequency: Tensor, tolerance: float) -> None:
+    def __init__(self, chain: Chain, state: State, frequency: Tensor | None, tolerance: float) -> None:
         from torchchain.evolvers import stencil  # imports Numba
 
         n = chain.n_particles
@@ -220,11 +220,17 @@ class CompiledAdvance:
 
         masses, springs = plain(chain.masses), plain(chain.in_a_row(chain.contact_stiffness))
         states = torch.stack([state.displacement.detach(), state.velocity.detach()], dim=-2)
+        if frequency is None:
+            squared, count = np.empty(len(masses)), len(masses)
+            side_by_side(lambda *rows: stencil.squared_bounds(*rows, masses, springs, chain.is_free, SWEEPS, squared), count)
+            frequencies = rounded_up(np.sqrt(squared))
+        else:
+            frequencies = frequency.reshape(-1).numpy()
         self.rows: Rows = stencil.Rows(
             masses=masses,
             contacts=springs,
             rigid_masses=plain(chain.rigid_mass[..., None])[:, 0],
-            frequencies=frequency.reshape(-1).numpy(),
+            frequencies=frequencies,
             states=states.double().reshape(-1, 2, n).numpy(),
             starts=math.prod(state.displacement.shape[:-1]) // len(masses),
             periodic=chain.is_free,
