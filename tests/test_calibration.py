@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
+from made import basis_matrix, conserving_rates
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
@@ -17,16 +18,6 @@ from torchchain.master.report import Rung
 B = 4
 XI = 0.3
 TIMES = np.arange(0, 30.01, 0.25)
-
-
-def conserving_rates(seed=0, top=0.1):
-    rates = top * (0.2 + np.random.default_rng(seed).random((B, B)))
-    np.fill_diagonal(rates, 0)
-    return rates - np.diag(rates.sum(1))
-
-
-def basis_matrix(seed=1):
-    return 0.6 * np.random.default_rng(seed).dirichlet(np.ones(B), B)
 
 
 def transfer_of(mean, times=TIMES, long_time=None, noise=0.0, disorder=None):
@@ -64,7 +55,7 @@ def distance(master, transfer):
 
 
 def test_linear_fit_of_straight_lines():
-    rates, t0 = conserving_rates(), 0.4
+    rates, t0 = conserving_rates(B), 0.4
     mean = np.stack([np.eye(B) + (1 - psi())[:, None] * rates * (t - t0) for t in TIMES], axis=1)
     master = tc.calibrate(transfer_of(mean), "linear", "paper")
     np.testing.assert_allclose(master.rates.detach().numpy(), rates, rtol=0, atol=1e-12)
@@ -76,7 +67,7 @@ def test_linear_fit_of_straight_lines():
 
 @pytest.mark.parametrize("window", [(0.5, 2.0), (1.0, 2.0), (0.0, 30.0), (0.25, 0.5)])
 def test_linear_fit_is_least_squares_in_the_window(window):
-    mean = markov(conserving_rates(), np.diag(psi()))
+    mean = markov(conserving_rates(B), np.diag(psi()))
     inside = (window[0] <= TIMES) & (window[1] >= TIMES)
     master = tc.calibrate(transfer_of(mean), "linear", "paper", window)
     for s in range(B):
@@ -159,7 +150,7 @@ def test_nonlinear_fit_of_constants():
 
 
 def test_rates_that_make_energy_grow_are_reported():
-    growing = conserving_rates() + 0.02 * np.eye(B)
+    growing = conserving_rates(B) + 0.02 * np.eye(B)
     mean = np.stack([np.eye(B) + (1 - psi())[:, None] * growing * t for t in TIMES], axis=1)
     with pytest.warns(FitWarning, match=r"rates fitted by 'linear' make energy grow as exp\(0.02 t\).*beyond t = 50"):
         tc.calibrate(transfer_of(mean), "linear", "paper")
@@ -171,9 +162,9 @@ def test_rates_that_make_energy_grow_are_reported():
 @pytest.mark.parametrize("constraint", ["exact", "penalty"])
 @pytest.mark.parametrize("model", ["paper", "basis_matrix"])
 def test_adam_recovers_known_rates(model, constraint):
-    rates = conserving_rates()
-    basis = np.diag(psi()) if model == "paper" else basis_matrix()
-    transfer = transfer_of(markov(rates, basis), long_time=basis_matrix())
+    rates = conserving_rates(B)
+    basis = np.diag(psi()) if model == "paper" else basis_matrix(B)
+    transfer = transfer_of(markov(rates, basis), long_time=basis_matrix(B))
     with warnings.catch_warnings():  # without noise the loss has no floor to converge to
         warnings.simplefilter("ignore", FitWarning)
         master = tc.calibrate(transfer, "adam", model, constraint=constraint, steps=1000)
@@ -187,7 +178,7 @@ def test_adam_recovers_known_rates(model, constraint):
 
 @pytest.mark.filterwarnings("ignore::torchchain.master.fits.FitWarning")
 def test_adam_is_deterministic():
-    transfer = transfer_of(markov(conserving_rates(), np.diag(psi())), noise=0.01)
+    transfer = transfer_of(markov(conserving_rates(B), np.diag(psi())), noise=0.01)
     torch.manual_seed(1)
     first = tc.calibrate(transfer, "adam", "paper", steps=60, tolerance=0.0)
     torch.manual_seed(2)
@@ -198,7 +189,7 @@ def test_adam_is_deterministic():
 
 @pytest.mark.filterwarnings("ignore::torchchain.master.fits.FitWarning")
 def test_the_exact_constraint_holds_whatever_the_data():
-    leaky = markov(conserving_rates(), np.diag(psi())) * np.exp(-0.02 * TIMES)[:, None]  # loses energy
+    leaky = markov(conserving_rates(B), np.diag(psi())) * np.exp(-0.02 * TIMES)[:, None]  # loses energy
     leaky[0, :, 3] -= 0.05 * (1 - np.exp(-TIMES / 5))  # asks for a negative rate
     exact = tc.calibrate(transfer_of(leaky), "adam", "paper", steps=200, tolerance=1e-3)
     assert exact.conservation_defect < 1e-15
@@ -219,7 +210,7 @@ def test_the_exact_constraint_holds_whatever_the_data():
 
 
 def test_adam_warns_when_it_stops_early():
-    transfer = transfer_of(markov(conserving_rates(), np.diag(psi())))
+    transfer = transfer_of(markov(conserving_rates(B), np.diag(psi())))
     with pytest.warns(FitWarning, match="Adam did not converge in 5 steps"):
         master = tc.calibrate(transfer, "adam", "paper", steps=5)
     assert not master.calibration.report.fit.converged
@@ -227,7 +218,7 @@ def test_adam_warns_when_it_stops_early():
 
 
 def test_adam_never_ends_above_where_it_began():
-    transfer = transfer_of(markov(conserving_rates(), np.diag(psi())))
+    transfer = transfer_of(markov(conserving_rates(B), np.diag(psi())))
     with pytest.warns(FitWarning):
         wild = tc.calibrate(transfer, "adam", "paper", constraint="penalty", learning_rate=10.0, steps=20)
     assert wild.calibration.report.fit.loss <= wild.calibration.report.fit.first_loss
@@ -330,7 +321,7 @@ def test_hardly_any_disorder_moves_hardly_anything(strength, method, model):
     np.testing.assert_allclose(shares, np.eye(B)[:, None].repeat(3, 1), atol=max(1e-6, 100 * strength**1.5))
 
 
-DATA = transfer_of(markov(conserving_rates(), np.diag(psi())), long_time=np.diag(psi()))
+DATA = transfer_of(markov(conserving_rates(B), np.diag(psi())), long_time=np.diag(psi()))
 
 
 @pytest.mark.parametrize(
@@ -379,7 +370,7 @@ def test_bad_requests(arguments, settings, error, message):
 
 def test_no_more_functions_than_the_times_tell_apart():
     few = np.arange(0, 2.6, 0.5)
-    short = transfer_of(markov(conserving_rates(), np.diag(psi()), few), few, np.diag(psi()))
+    short = transfer_of(markov(conserving_rates(B), np.diag(psi()), few), few, np.diag(psi()))
     with pytest.raises(FieldError, match=r"order must have at most 3 functions for 6 times, got \(2, 1\)"):
         tc.calibrate(short, order=(2, 1))
     assert tc.calibrate(short, order=(1, 1)).calibration.report.fit.order == (1, 1)
@@ -387,6 +378,6 @@ def test_no_more_functions_than_the_times_tell_apart():
 
 @pytest.mark.parametrize("model", ["exact_psi", "basis_matrix", "memory"])
 def test_models_that_need_the_long_time_average(model):
-    without = transfer_of(markov(conserving_rates(), np.diag(psi())))
+    without = transfer_of(markov(conserving_rates(B), np.diag(psi())))
     with pytest.raises(FieldError, match="transfer must hold the long-time average for this model"):
         tc.calibrate(without, model=model)

@@ -10,6 +10,7 @@ import scipy.integrate
 import scipy.linalg
 import torch
 import xarray
+from made import basis_matrix, conserving_rates
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
@@ -25,16 +26,6 @@ from torchchain.master.selection import rungs
 B = 4
 EYE = torch.eye(B, dtype=torch.float64)
 TIMES = np.arange(0, 40.01, 0.5)
-
-
-def conserving_rates(seed=0, top=0.1):
-    rates = top * (0.2 + np.random.default_rng(seed).random((B, B)))
-    np.fill_diagonal(rates, 0)
-    return rates - np.diag(rates.sum(1))
-
-
-def basis_matrix(seed=1):
-    return 0.6 * np.random.default_rng(seed).dirichlet(np.ones(B), B)
 
 
 def swing_in(rates, basis, delay, times=TIMES):
@@ -69,17 +60,17 @@ def transfer_of(mean, long_time, times=TIMES, noise=0.0, blocks=20, seed=5, **sc
 
 def test_swing_in_is_release_then_rates():
     model = SwingInModel(
-        *map(torch.from_numpy, (conserving_rates(), basis_matrix())), torch.tensor(1.3, dtype=torch.float64)
+        *map(torch.from_numpy, (conserving_rates(B), basis_matrix(B))), torch.tensor(1.3, dtype=torch.float64)
     )
     times = torch.tensor([0.0, 0.1, 1.0, 7.0, 30.0], dtype=torch.float64)
-    expected = swing_in(conserving_rates(), basis_matrix(), 1.3, times.numpy())
+    expected = swing_in(conserving_rates(B), basis_matrix(B), 1.3, times.numpy())
     np.testing.assert_allclose(model.transfer(times).detach().numpy(), expected, rtol=0, atol=1e-11)
     solved = tc.MasterEquation(model, None).solve(EYE, times, "dopri8").detach()
     np.testing.assert_allclose(solved.numpy(), expected, rtol=0, atol=1e-7)
 
 
 def test_swing_in_starts_flat_conserves_and_stays_positive():
-    model = SwingInModel(*map(torch.from_numpy, (conserving_rates(), np.zeros((B, B)))), torch.tensor(2.0))
+    model = SwingInModel(*map(torch.from_numpy, (conserving_rates(B), np.zeros((B, B)))), torch.tensor(2.0))
     early = model.transfer(torch.tensor([0.0, 1e-3, 2e-3], dtype=torch.float64)).detach()
     lost = 1 - early.diagonal(dim1=0, dim2=2)
     np.testing.assert_allclose((lost[2] / lost[1]).numpy(), 4, rtol=2e-3)  # t^2, not t
@@ -89,7 +80,7 @@ def test_swing_in_starts_flat_conserves_and_stays_positive():
 
 
 def test_late_energies_are_those_a_delay_earlier():
-    rates, basis = map(torch.from_numpy, (conserving_rates(top=0.01), np.zeros((B, B))))
+    rates, basis = map(torch.from_numpy, (conserving_rates(B, top=0.01), np.zeros((B, B))))
     delayed = SwingInModel(rates, basis, torch.tensor(2.0)).transfer(torch.tensor([52.0], dtype=torch.float64))
     plain = tc.RateModel(rates, basis).transfer(torch.tensor([50.0], dtype=torch.float64))
     assert float((delayed - plain).abs().max()) < 1e-3
@@ -103,15 +94,15 @@ def test_late_energies_are_those_a_delay_earlier():
 def test_known_rates_are_recovered_without_noise(model):
     delay, times = 1.2, np.arange(0, 24.01, 1.0)
     mean = (
-        swing_in(conserving_rates(), basis_matrix(), delay, times)
+        swing_in(conserving_rates(B), basis_matrix(B), delay, times)
         if model == "swing_in"
-        else tc.RateModel(*map(torch.from_numpy, (conserving_rates(), basis_matrix())))
+        else tc.RateModel(*map(torch.from_numpy, (conserving_rates(B), basis_matrix(B))))
         .transfer(torch.from_numpy(times))
         .detach()
     )
-    transfer = transfer_of(mean, basis_matrix(), times)
+    transfer = transfer_of(mean, basis_matrix(B), times)
     master = tc.calibrate(transfer, "adam", model, (1.0, 2.0), tolerance=0, steps=1500)
-    np.testing.assert_allclose(master.rates.detach().numpy(), conserving_rates(), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(master.rates.detach().numpy(), conserving_rates(B), rtol=0, atol=1e-4)
     if model == "swing_in":
         assert float(master.model.delay[0]) == pytest.approx(delay, abs=1e-2)
         assert master.model.n_parameters == 2 * B**2 + 1
@@ -127,12 +118,12 @@ def test_bad_delays(delay):
 
 
 def test_known_model_within_its_error_bars():
-    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(), basis_matrix())))
+    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(B), basis_matrix(B))))
     times = np.arange(0, 24.01, 1.0)
     exact = truth.transfer(torch.from_numpy(times)).detach()
     rates, energies = [], []
     for seed in range(3):
-        data = transfer_of(exact.numpy(), basis_matrix(), times, noise=0.01, seed=seed)
+        data = transfer_of(exact.numpy(), basis_matrix(B), times, noise=0.01, seed=seed)
         master = tc.calibrate(data, "adam", "basis_matrix", (1.0, 2.0), bootstrap=10, steps=300)
         rates.append((master.rates.detach() - truth.rates.detach()).abs() < 3 * master.uncertainty.rates_stderr)
         found, error = master.solve(EYE, times).detach(), master.standard_error(EYE, times)
@@ -158,10 +149,10 @@ def test_rungs_come_in_order_of_their_size(small_transfer):
 
 
 def test_the_smallest_model_that_fits_is_chosen():
-    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(), basis_matrix())))
+    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(B), basis_matrix(B))))
     mean = truth.transfer(torch.from_numpy(TIMES)).detach().numpy()
     coarse, fine = (
-        tc.calibrate(transfer_of(mean, basis_matrix(), noise=noise), bootstrap=0).calibration.report.selection
+        tc.calibrate(transfer_of(mean, basis_matrix(B), noise=noise), bootstrap=0).calibration.report.selection
         for noise in (0.3, 0.003)
     )
     assert len(coarse.tried) < len(fine.tried)
@@ -171,9 +162,9 @@ def test_the_smallest_model_that_fits_is_chosen():
 
 
 def test_too_few_blocks_hold_nothing_out():
-    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(), basis_matrix())))
+    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(B), basis_matrix(B))))
     mean = truth.transfer(torch.from_numpy(TIMES)).detach().numpy()
-    master = tc.calibrate(transfer_of(mean, basis_matrix(), noise=0.01, blocks=3))
+    master = tc.calibrate(transfer_of(mean, basis_matrix(B), noise=0.01, blocks=3))
     assert "too few blocks" in master.calibration.report.selection.reason
     assert master.uncertainty is None
 
@@ -338,7 +329,7 @@ def test_predictions_beyond_the_horizon_warn(small_transfer):
 
 
 def test_a_settled_ensemble_has_no_horizon():
-    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(top=1.0), basis_matrix())))
+    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(B, top=1.0), basis_matrix(B))))
     settled = truth.transfer(torch.tensor([1e4], dtype=torch.float64))[:, 0].detach().numpy()
     times = np.arange(0, 40.01, 0.5)
     mean = truth.transfer(torch.from_numpy(times)).detach().numpy()
@@ -399,7 +390,7 @@ def test_bands_can_be_joined_but_not_split(small_transfer):
 @pytest.mark.parametrize("method", ["expm", "dopri8", "rk4"])
 @pytest.mark.parametrize("grid", [[0.0, 1.0, 2.0, 3.0], [0.5, 2.0, 2.25]])
 def test_constant_supply(method, grid):
-    rates, basis = conserving_rates(), basis_matrix()
+    rates, basis = conserving_rates(B), basis_matrix(B)
     master = tc.MasterEquation(tc.RateModel(*map(torch.from_numpy, (rates, basis))), None)
     supply = np.array([0.3, 0.0, 0.1, 0.0])
     options = {"step": 0.01} if method == "rk4" else {}
@@ -413,7 +404,7 @@ def test_constant_supply(method, grid):
 
 
 def test_supply_in_steps_is_the_sum_of_its_steps():
-    master = tc.MasterEquation(tc.RateModel(*map(torch.from_numpy, (conserving_rates(), basis_matrix()))), None)
+    master = tc.MasterEquation(tc.RateModel(*map(torch.from_numpy, (conserving_rates(B), basis_matrix(B)))), None)
     times = [1.0, 2.0, 4.0]
     steps = torch.rand(2, 3, B, dtype=torch.float64)
     start = torch.rand(2, B, dtype=torch.float64)
@@ -431,7 +422,7 @@ def test_supply_in_steps_is_the_sum_of_its_steps():
 
 @pytest.mark.parametrize("supply", [1.0, [1.0], np.zeros((2, B)), np.zeros((5, 3, B)), [math.nan] * B])
 def test_bad_supplies(supply):
-    master = tc.MasterEquation(tc.RateModel(*map(torch.from_numpy, (conserving_rates(), basis_matrix()))), None)
+    master = tc.MasterEquation(tc.RateModel(*map(torch.from_numpy, (conserving_rates(B), basis_matrix(B)))), None)
     with pytest.raises((FieldError, FieldTypeError), match="supply must"):
         master.solve(torch.zeros(2, B), [1.0, 2.0, 3.0], supply=supply)
 
@@ -446,7 +437,7 @@ def damped_data(damping, rates, basis):
 
 def test_damping_is_recovered_from_the_loss():
     damping = np.array([0.01, 0.03, 0.05, 0.2])
-    mean, times = damped_data(damping, conserving_rates(), basis_matrix() * 0)
+    mean, times = damped_data(damping, conserving_rates(B), basis_matrix(B) * 0)
     sample = Sample(torch.from_numpy(times), torch.from_numpy(mean), None, 0.3, True)
     np.testing.assert_allclose(loss_rates(sample).numpy(), damping, rtol=2e-3)  # the trapezoidal rule's error
 
@@ -454,7 +445,7 @@ def test_damping_is_recovered_from_the_loss():
 @pytest.mark.parametrize("model", ["paper", "memory"])
 def test_dissipated_energy_is_accounted_for(model):
     damping = np.array([0.02, 0.03, 0.05, 0.1])
-    mean, times = damped_data(damping, conserving_rates(), basis_matrix() * 0)
+    mean, times = damped_data(damping, conserving_rates(B), basis_matrix(B) * 0)
     transfer = transfer_of(mean[:, ::10], None, times[::10], noise=1e-4, damping=0.1)
     master = tc.calibrate(
         transfer,
@@ -497,7 +488,7 @@ def test_damped_chains_end_to_end():
 def test_flows_on_an_uneven_grid():
     times = torch.cat([torch.arange(0, 5, 0.25), torch.arange(5, 25, 0.5), torch.tensor([25.1, 31.0, 99.0])]).double()
     assert [count for _, count in equal_steps(times)] == [20, 39, 1, 1, 1]
-    rates = conserving_rates()
+    rates = conserving_rates(B)
     expected = np.stack([scipy.linalg.expm(rates * t) for t in times.numpy()], axis=1)
     np.testing.assert_allclose(flows(EYE, torch.from_numpy(rates), times).numpy(), expected, rtol=0, atol=1e-13)
 
@@ -506,7 +497,7 @@ def test_flows_on_an_uneven_grid():
 
 
 def markov_transfer(noise):
-    truth = tc.RateModel(torch.from_numpy(conserving_rates()), torch.zeros(B))
+    truth = tc.RateModel(torch.from_numpy(conserving_rates(B)), torch.zeros(B))
     mean = truth.transfer(torch.from_numpy(TIMES)).detach().numpy()
     return transfer_of(mean, np.full((B, B), 1 / B), noise=noise)
 
@@ -520,14 +511,14 @@ def test_markovian_data_pass_chapman_kolmogorov():
 
 
 def test_energy_that_stays_fails_chapman_kolmogorov():
-    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(), basis_matrix())))
+    truth = tc.RateModel(*map(torch.from_numpy, (conserving_rates(B), basis_matrix(B))))
     mean = truth.transfer(torch.from_numpy(TIMES)).detach().numpy()
-    result = chapman_kolmogorov(transfer_of(mean, basis_matrix(), noise=0.001), 5.0, (4,))
+    result = chapman_kolmogorov(transfer_of(mean, basis_matrix(B), noise=0.001), 5.0, (4,))
     assert float((result.distance / result.statistical).mean()) > 5
 
 
 def test_implied_timescales_of_known_rates():
-    exact = np.sort(-1 / np.linalg.eigvals(conserving_rates()).real)
+    exact = np.sort(-1 / np.linalg.eigvals(conserving_rates(B)).real)
     exact = np.sort(exact[np.abs(exact) < 1e6])[::-1]
     scales, error = implied_timescales(markov_transfer(1e-5), [1.0, 5.0, 10.0])
     assert scales.shape == error.shape == (3, B - 1)

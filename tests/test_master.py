@@ -1,9 +1,12 @@
 """The master equation: its solution by every solver against SciPy, and what it conserves."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import scipy.linalg
 import torch
+from made import basis_matrix, conserving_rates
 
 import torchchain as tc
 from torchchain.checks import FieldError, FieldTypeError
@@ -17,18 +20,7 @@ ORDERS = {entry.name: entry.order for entry in INTEGRATORS.values() if entry.ord
 ADAPTIVE = tuple(name for name in ORDERS if INTEGRATORS[name].adaptive)
 B = 5
 RANDOM = np.random.default_rng(0)
-
-
-def conserving_rates(n=B, top=0.4, seed=0):
-    """Rates between bands from 0 to ``top``, far from symmetric, with rows that sum to zero."""
-    rates = top * np.random.default_rng(seed).random((n, n))
-    np.fill_diagonal(rates, 0)
-    return rates - np.diag(rates.sum(1))
-
-
-def basis_matrix(n=B, seed=1):
-    """Shares that stay, rows that sum to 0.6 or so."""
-    return 0.6 * np.random.default_rng(seed).dirichlet(np.ones(n), n)
+rates_of = partial(conserving_rates, top=0.4, least=0.0)
 
 
 def master(rates, basis, damping=None, dtype=torch.float64):
@@ -59,10 +51,10 @@ GRIDS = {
 
 
 @pytest.mark.parametrize("damped", [False, True])
-@pytest.mark.parametrize("basis", [np.zeros(B), np.linspace(0.1, 0.9, B), basis_matrix()], ids=["none", "psi", "pi"])
+@pytest.mark.parametrize("basis", [np.zeros(B), np.linspace(0.1, 0.9, B), basis_matrix(B)], ids=["none", "psi", "pi"])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_matrix_exponential(grid, basis, damped):
-    rates, times = conserving_rates(), GRIDS[grid]
+    rates, times = rates_of(B), GRIDS[grid]
     damping = np.linspace(0, 0.02, B) if damped else np.zeros(B)
     initial = np.array([0.1, 0.0, 0.5, 0.4, 0.0])
     solved = master(rates, basis, damping).solve(initial, times)
@@ -75,7 +67,7 @@ def test_matrix_exponential(grid, basis, damped):
 
 def test_the_literal_master_equation():
     # Eq. 48 element by element: e_s' = Q_ss f_s + sum_r Q_rs f_r of the free energy f = e - e0, and Eq. 51's -d_s e_s.
-    rates, psi, damping = conserving_rates(), np.linspace(0.1, 0.9, B), np.linspace(0, 0.02, B)
+    rates, psi, damping = rates_of(B), np.linspace(0.1, 0.9, B), np.linspace(0, 0.02, B)
     initial = np.array([0.1, 0.0, 0.5, 0.4, 0.0])
     model = master(rates, psi, damping)
     h = 1e-4
@@ -96,7 +88,7 @@ def test_rows_are_sources():
 
 
 def test_any_initial_distribution():
-    model = master(conserving_rates(), basis_matrix())
+    model = master(rates_of(B), basis_matrix(B))
     times = [0.0, 1.0, 30.0]
     unit = model.solve(torch.eye(B, dtype=torch.float64), times)
     initial = torch.from_numpy(RANDOM.normal(size=(2, 3, B)))  # any unit, any sign: the equation is linear
@@ -112,7 +104,7 @@ def test_any_initial_distribution():
 
 @pytest.mark.parametrize("method", tc.SOLVERS)
 def test_every_solver(method):
-    rates, basis, damping = conserving_rates(), basis_matrix(), np.linspace(0, 0.02, B)
+    rates, basis, damping = rates_of(B), basis_matrix(B), np.linspace(0, 0.02, B)
     model = master(rates, basis, damping)
     initial = np.eye(B)[:2]
     options = {"step": 0.02} if method in FIXED else {"rtol": 1e-5} if method == "adaptive_heun" else {}
@@ -133,7 +125,7 @@ def test_every_solver(method):
 
 @pytest.mark.parametrize("method", [name for name in FIXED if name in ORDERS])
 def test_observed_order(method):
-    model = master(conserving_rates(), np.zeros(B))
+    model = master(rates_of(B), np.zeros(B))
     exact = model.solve(np.eye(B), [4.0])
     errors = [(model.solve(np.eye(B), [4.0], method, step=h) - exact).abs().max().item() for h in (0.4, 0.2, 0.1)]
     slopes = np.diff(np.log(errors)) / np.log(0.5)
@@ -177,8 +169,8 @@ def test_oscillations_that_decay_do_not_grow_by_the_steps_chosen(method):
 
 def test_the_worst_member_of_a_batch_sets_the_step():
     # 200 members that stand still must not dilute the error of one that moves.
-    model = master(conserving_rates(), np.zeros(B))
-    stationary = scipy.linalg.null_space(conserving_rates().T)[:, 0]
+    model = master(rates_of(B), np.zeros(B))
+    stationary = scipy.linalg.null_space(rates_of(B).T)[:, 0]
     batch = np.tile(stationary, (201, 1))
     batch[7] = np.eye(B)[2]
     solved = model.solve(batch, [20.0], "dopri5", rtol=1e-6, atol=1e-9)[7]
@@ -188,7 +180,7 @@ def test_the_worst_member_of_a_batch_sets_the_step():
 @pytest.mark.parametrize("method", ["expm", "dopri8"])
 def test_semigroup(method):
     # Without basis energy, going on from where one was is the same as going all the way.
-    model = master(conserving_rates(), np.zeros(B))
+    model = master(rates_of(B), np.zeros(B))
     initial = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
     there = model.solve(initial, [13.0], method).detach()
     halfway = model.solve(initial, [5.0], method).detach()[-1]
@@ -196,16 +188,16 @@ def test_semigroup(method):
         model.solve(halfway, [8.0], method), there, rtol=0, atol=1e-7 if method == "dopri8" else 1e-13
     )
     # and with it, in the enlarged state
-    parts = master(conserving_rates(), basis_matrix()).model.embedding()
+    parts = master(rates_of(B), basis_matrix(B)).model.embedding()
     step = torch.linalg.matrix_exp(5 * parts.generator)
     rest = torch.linalg.matrix_exp(8 * parts.generator)
     whole = parts.start @ step @ rest @ parts.readout
-    solved = master(conserving_rates(), basis_matrix()).solve(np.eye(B), [13.0])[:, 0]
+    solved = master(rates_of(B), basis_matrix(B)).solve(np.eye(B), [13.0])[:, 0]
     assert torch.allclose(whole, solved, rtol=0, atol=1e-13)
 
 
 def test_energy_is_conserved():
-    model = master(conserving_rates(), basis_matrix())
+    model = master(rates_of(B), basis_matrix(B))
     energy = model.solve(np.eye(B), np.arange(0, 1000, 0.5)).sum(-1)
     assert torch.allclose(energy, torch.ones_like(energy), rtol=0, atol=1e-12)
     assert model.conservation_defect < 1e-15
@@ -213,7 +205,7 @@ def test_energy_is_conserved():
 
 
 def test_leaks_and_negative_rates_are_reported():
-    rates = conserving_rates()
+    rates = rates_of(B)
     rates[1, 1] += 0.03
     rates[2, 4] = -0.05
     model = master(rates, np.zeros(B))
@@ -222,7 +214,7 @@ def test_leaks_and_negative_rates_are_reported():
 
 
 def test_energy_settles_where_rates_balance():
-    rates, basis = conserving_rates(), np.linspace(0.1, 0.9, B)
+    rates, basis = rates_of(B), np.linspace(0.1, 0.9, B)
     stationary = np.abs(scipy.linalg.null_space(rates.T)[:, 0])
     stationary /= stationary.sum()
     late = master(rates, basis).solve(np.eye(B), [1e4])[:, 0].detach().numpy()
@@ -231,13 +223,13 @@ def test_energy_settles_where_rates_balance():
 
 def test_damping_of_all_bands_alike():
     times = np.array([0.0, 1.0, 20.0])
-    free, damped = (master(conserving_rates(), basis_matrix(), np.full(B, d)) for d in (0.0, 0.05))
+    free, damped = (master(rates_of(B), basis_matrix(B), np.full(B, d)) for d in (0.0, 0.05))
     expected = free.solve(np.eye(B), times).detach().numpy() * np.exp(-0.05 * times)[:, None]
     np.testing.assert_allclose(damped.solve(np.eye(B), times).detach().numpy(), expected, rtol=1e-12)
 
 
 def test_rates_are_trainable():
-    model = master(conserving_rates(), basis_matrix())
+    model = master(rates_of(B), basis_matrix(B))
     (parameter,) = model.parameters()
     assert parameter is model.rates
     target = (1, 3)
@@ -245,17 +237,17 @@ def test_rates_are_trainable():
         (gradient,) = torch.autograd.grad(model.solve(np.eye(B), times)[0, -1, 3], parameter)
         bumped = []
         for h in (1e-6, -1e-6):
-            rates = conserving_rates()
+            rates = rates_of(B)
             rates[target] += h
-            bumped.append(master(rates, basis_matrix()).solve(np.eye(B), times)[0, -1, 3].item())
+            bumped.append(master(rates, basis_matrix(B)).solve(np.eye(B), times)[0, -1, 3].item())
         assert gradient[target].item() == pytest.approx((bumped[0] - bumped[1]) / 2e-6, rel=1e-6)
 
 
 def test_single_precision_and_mixed_inputs():
-    model = master(conserving_rates(), basis_matrix(), dtype=torch.float32)
+    model = master(rates_of(B), basis_matrix(B), dtype=torch.float32)
     solved = model.solve(np.eye(B), np.arange(0, 10, 0.5))
     assert solved.dtype == torch.float32
-    double = master(conserving_rates(), basis_matrix()).solve(np.eye(B), np.arange(0, 10, 0.5))
+    double = master(rates_of(B), basis_matrix(B)).solve(np.eye(B), np.arange(0, 10, 0.5))
     assert torch.allclose(solved.double(), double, atol=1e-5)
     mixed = tc.RateModel(torch.zeros(2, 2), torch.zeros(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))
     assert mixed.basis.dtype == mixed.damping.dtype == torch.float32
@@ -308,7 +300,7 @@ def test_memory_model(damped):
 
 
 NAN = float("nan")
-MODEL = master(conserving_rates(), basis_matrix())
+MODEL = master(rates_of(B), basis_matrix(B))
 EXPLODING = master(np.diag(np.full(B, 1.0)), np.zeros(B))
 
 
@@ -364,7 +356,7 @@ def test_growth_beyond_all_numbers_is_an_error(method):
 
 
 def test_the_latest_time_of_the_matrix_exponential():
-    rates = conserving_rates()
+    rates = rates_of(B)
     latest = 1e9 / abs(rates).sum(1).max()
     stationary = np.abs(scipy.linalg.null_space(rates.T)[:, 0])
     late = master(rates, np.zeros(B)).solve(np.eye(B), [0.999 * latest])[:, 0].detach().numpy()
@@ -375,7 +367,7 @@ def test_the_latest_time_of_the_matrix_exponential():
 
 def test_an_output_time_costs_no_accuracy():
     # The dense output of dopri8 between its steps is of order 4 only: steps end at the output times.
-    model = master(conserving_rates(), np.zeros(B))
+    model = master(rates_of(B), np.zeros(B))
     times = np.linspace(0, 30, 50)
     error = (model.solve(np.eye(B), times, "dopri8") - model.solve(np.eye(B), times)).abs().max().item()
     assert error < 1e-9
