@@ -1,10 +1,17 @@
+import contextlib
+import inspect
 import pkgutil
 import subprocess
 import sys
+import typing
+from pathlib import Path
 
 import pytest
 
 import torchchain as tc
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "docs" / "_ext"))
+import api_pages
 
 
 def test_every_public_name_resolves():
@@ -55,6 +62,24 @@ def test_names_that_were_public_before():
         wavenumber_energy wavenumber_energy_matrix weak_disorder_lyapunov zero_wavenumber_share""".split()
     for name in earlier:
         assert getattr(tc, name) is not None
+
+
+def test_types_that_public_signatures_mention_are_public():
+    public = api_pages.public_names() | vars(tc.localization)
+    known = {id(value) for value in public.values()}
+
+    def mentioned(hint):
+        own = isinstance(hint, type) and hint.__module__.startswith("torchchain")
+        return {hint} if own else set().union(*map(mentioned, typing.get_args(hint)))
+
+    missing = set()
+    for name, value in public.items():
+        if not (inspect.isfunction(value) or inspect.isclass(value)) or not value.__module__.startswith("torchchain"):
+            continue
+        with contextlib.suppress(NameError):  # a type that only type checkers import
+            hints = typing.get_type_hints(value)
+            missing |= {f"{kind.__name__} of {name}" for hint in hints.values() for kind in mentioned(hint) if id(kind) not in known}
+    assert not missing
 
 
 def test_rooms_as_namespaces():

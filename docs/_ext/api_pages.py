@@ -33,7 +33,7 @@ TOPICS: dict[str, tuple[str, str]] = {
         "Scenes, ensembles, plans",
         "Scene simulate plan Plan BandTransfer band_transfer Provenance estimate_disorder statistical_distance "
         "total_variation plot_observable register_observable Observable OBSERVABLES Checkpoint CheckpointWarning SeamWarning open RunFolder "
-        "FieldError FieldTypeError",
+        "FieldError FieldTypeError ensemble.*",
     ),
     "master": (
         "Master equations",

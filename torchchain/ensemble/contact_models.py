@@ -29,7 +29,7 @@ class ContactModel:
         enough: whether it is here.
 
     Example:
-        >>> [model.name for model in tc.plan(tc.Scene(n_particles=64, n_bands=8, contact="auto")).contact_models if model.enough]
+        >>> [model.name for model in tc.plan(tc.Scene(n_particles=64, n_bands=8)).contact_models if model.enough]
         ['linear', 'linear plus quadratic', 'hertz']
     """
 

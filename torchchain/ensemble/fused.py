@@ -38,6 +38,12 @@ class EnergyMoments:
     """Total energy, its center R (Eq. 37) and mean squared width r^2 (Eq. 38), each (*batch, *any, time).
 
     The sums over particles p of E_p, p E_p and p^2 E_p are total, total * center and total * (width + center^2).
+
+    Example:
+        >>> chain = tc.Chain(torch.ones(8, dtype=torch.float64), "fixed")
+        >>> found = tc.energy_moments(chain, tc.impulse(chain, site=4), [0.0])
+        >>> found.center.tolist(), found.width.tolist()
+        ([4.0], [0.0])
     """
 
     total: Tensor

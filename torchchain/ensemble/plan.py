@@ -35,9 +35,18 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Choice:
-    """One way to run a scene: method, options and precision, what it is predicted to cost and to err, and may err.
+    """One way to run a scene.
 
-    ``cost`` is in seconds of one nominal core: it ranks the ways, the same on every machine.
+    Attributes:
+        method, options, dtype: of the run.
+        predicted_error: of the method, relative to the scale of the observables.
+        cost: seconds of one nominal core: it ranks the ways, the same on every machine.
+        predicted_seconds: wall time on this machine.
+        allowed: error up to which the way will do.
+
+    Example:
+        >>> [choice.good for choice in tc.plan(tc.Scene(n_particles=64, n_bands=8, tolerance=1e-3)).choices][:2]
+        [True, True]
     """
 
     method: str
@@ -321,7 +330,11 @@ def _settled(
     growing = f"{size} and energies by up to {off:.1e} at the last time"
     if off <= CONTACT_FRACTION * tolerance:
         return replace(scene, contact="linear"), facts, [f"linear contacts: {growing}, within the tolerance"], off
-    scene = replace(scene, contact="hertz")
+    try:
+        scene = replace(scene, contact="hertz")
+    except checks.FieldError as error:
+        told = str(error).rpartition(", got ")[0]
+        raise checks.FieldError(f"{told}, got 'auto' and {growing}, {tolerance:.1e} allowed") from None
     return scene, Facts(scene), [f"Hertz contacts: with linear ones {growing}, more than the tolerance allows"], 0.0
 
 

@@ -25,6 +25,14 @@ class Ranks:
     """This process among those that share an ensemble; alone by default.
 
     What passes between ranks are settings at the start and reduced moments at the end, on the CPU.
+
+    Attributes:
+        rank: number of this process, from 0.
+        size: number of processes.
+
+    Example:
+        >>> [list(tc.ensemble.Ranks(rank, 2).part([range(10)])[0]) for rank in (0, 1)]
+        [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
     """
 
     rank: int = 0

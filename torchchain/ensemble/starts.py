@@ -56,7 +56,7 @@ class StartTransfer:
         >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40, times=torch.linspace(0, 50, 51))
         >>> starts = tc.band_transfer(scene).starts
         >>> starts.tones[:4], tuple(starts.kicked.shape)
-        ((2, 4, 6, 8), (16, 32, 8))
+        ((2, 4, 6, 8), (16, 25, 8))
     """
 
     tones: tuple[int, ...]

@@ -14,7 +14,12 @@ from torchchain.frames.record import Box
 
 @dataclass(frozen=True)
 class Entry:
-    """Where a frame is in its file."""
+    """Where a frame is in its file.
+
+    Example:
+        >>> tc.frames.Entry(number=1, offset=0, count=12, step=100).time is None
+        True
+    """
 
     number: int
     """counted from 1"""
@@ -32,6 +37,11 @@ class Raw:
 
     ``columns`` has the names id, type, mass, radius, x, y, z, vx, vy, vz; of contacts id1, id2, overlap, normal_force.
     ``contacts`` has those that stand beside the particles: pairs of their places, overlap, normal_force.
+
+    Example:
+        >>> import numpy as np
+        >>> sorted(tc.frames.Raw({"id": np.arange(1, 4), "x": np.zeros(3)}).columns)
+        ['id', 'x']
     """
 
     columns: dict[str, np.ndarray]
@@ -48,6 +58,10 @@ class Scan:
         entries: of all whole frames.
         cut: words on a last frame that is not whole, or None.
         units: the file's own word for its units, or None.
+
+    Example:
+        >>> len(tc.frames.Scan([tc.frames.Entry(number=1, offset=0, count=12)]).entries)
+        1
     """
 
     entries: list[Entry]

@@ -11,18 +11,20 @@ from torchchain.master.ladder import MODELS, register_model
 from torchchain.master.memory import MemoryModel, ProjectionReport, ProjectionSettings
 from torchchain.master.model import Embedding, TransferModel
 from torchchain.master.paper_rates import paper_rates
+from torchchain.master.proof import Certificate
 from torchchain.master.rates import RateModel, SwingInModel
 from torchchain.master.records import Fit, NoSettings, Recipe, ReducedModel
 from torchchain.master.report import Calibration, Loss, Report, Rung, Selection
 from torchchain.master.sample import Sample
 from torchchain.master.solving import SOLVERS, IntegrationError
+from torchchain.master.starts import StartModel
 from torchchain.master.uncertainty import Uncertainty
 
 __all__ = [
-    "MODELS", "SOLVERS", "AdamReport", "AdamSettings", "AnalyticReport", "Calibration", "ChapmanKolmogorov",
-    "Embedding", "Fit", "FitWarning", "IntegrationError", "Loss", "MasterEquation", "MasterFamily", "MemoryModel",
+    "MODELS", "SOLVERS", "AdamReport", "AdamSettings", "AnalyticReport", "Calibration", "Certificate",
+    "ChapmanKolmogorov", "Embedding", "Fit", "FitWarning", "IntegrationError", "Loss", "MasterEquation", "MasterFamily", "MemoryModel",
     "NoSettings", "NonlinearReport", "PredictionWarning", "ProjectionReport", "ProjectionSettings", "RateModel",
-    "Recipe", "ReducedModel", "Report", "Rung", "Sample", "Selection", "SwingInModel", "TheoryModel", "TransferModel",
+    "Recipe", "ReducedModel", "Report", "Rung", "Sample", "Selection", "StartModel", "SwingInModel", "TheoryModel", "TransferModel",
     "Uncertainty", "calibrate", "calibrate_family", "chapman_kolmogorov", "implied_timescales", "paper_rates",
     "register_model",
 ]  # fmt: skip

@@ -23,6 +23,10 @@ class Certificate:
         conservation_defect: no row sum of T differs from 1 by more, infinity if T decays to zero (damped chains).
         tail: from this time on Pi outweighs all that still decays.
         intervals: of the time axis before it, that were needed.
+
+    Example:
+        >>> tc.master.Certificate(lower=0.0, upper=1.0, conservation_defect=1e-16, tail=300.0, intervals=800).holds
+        True
     """
 
     lower: float

@@ -68,6 +68,12 @@ class StartModel(nn.Module):
         rigid, onset: as of :class:`torchchain.master.tones.Tones`; 0 in files that do not know them.
         stderr: errors of T and T' at these times, [kind, source, start_time, receiver]; of no times in files that have
             ``scale`` alone.
+
+    Example:
+        >>> scene = tc.Scene(n_particles=64, n_bands=8, realizations=40, times=torch.linspace(0, 50, 51))
+        >>> starts = tc.calibrate(tc.band_transfer(scene), model="memory").starts
+        >>> starts.n_particles, starts.n_bands
+        (64, 8)
     """
 
     AXES: ClassVar[dict[str, tuple[str, ...]]] = {
