@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
+import operator
 import re
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -102,14 +103,10 @@ def number(
         raise fail(field, "be finite", value) from None
     if not math.isfinite(value):
         raise fail(field, "be finite", value)
-    if above is not None and not value > above:
-        raise fail(field, f"be greater than {above:g}", value)
-    if at_least is not None and not value >= at_least:
-        raise fail(field, f"be at least {at_least:g}", value)
-    if below is not None and not value < below:
-        raise fail(field, f"be less than {below:g}", value)
-    if at_most is not None and not value <= at_most:
-        raise fail(field, f"be at most {at_most:g}", value)
+    bounds = (operator.gt, "greater than", above), (operator.ge, "at least", at_least), (operator.lt, "less than", below)
+    for holds, words, bound in (*bounds, (operator.le, "at most", at_most)):
+        if bound is not None and not holds(value, bound):
+            raise fail(field, f"be {words} {bound:g}", value)
     return value
 
 

@@ -109,36 +109,22 @@ def log_map(
 
 def share_matrix(ax: Axes, shares: np.ndarray, title: str = "", floor: float = 1e-3) -> Axes:
     """Shares of the energy [source, receiver] at one time, logarithmic colors; less is drawn as the floor."""
-    from matplotlib.colors import LogNorm
-
-    bands = np.arange(1, len(shares) + 1)
-    image = ax.pcolormesh(
-        bands, bands, np.maximum(shares, floor), norm=LogNorm(floor, 1.0), shading="nearest", rasterized=True
-    )
-    _colorbar(ax, image, "share of energy", extend="min")
-    ax.set(xlabel="receiver $r$", ylabel="source $s$", title=title, aspect="equal")
-    ax.invert_yaxis()
-    return ax
+    return _matrix(ax, shares, "share of energy", title, floor, 1.0)
 
 
 def rate_map(ax: Axes, rates: np.ndarray, title: str = "", top: float | None = None) -> Axes:
     """Rates between bands (as Fig. 17), rates [source, receiver]; the diagonal shows the loss rate -Q_ss."""
     shown = np.where(np.eye(len(rates), dtype=bool), -rates, rates)
-    bands = np.arange(1, len(rates) + 1)
     top = float(shown.max()) if top is None else top
     top = top if top > 0 else 1.0
-    from matplotlib.colors import LogNorm
+    return _matrix(ax, shown, "rate", title, top * 1e-4, top)
 
-    image = ax.pcolormesh(
-        bands,
-        bands,
-        np.clip(shown, top * 1e-4, None),
-        norm=LogNorm(top * 1e-4, top),
-        shading="nearest",
-        rasterized=True,
-    )
-    _colorbar(ax, image, "rate", extend="min")
-    ax.set(xlabel="receiver $r$", ylabel="source $s$", title=title, aspect="equal")
+
+def _matrix(ax: Axes, values: np.ndarray, label: str, title: str, floor: float, top: float) -> Axes:
+    """Values [source, receiver], logarithmic colors from the floor to the top."""
+    bands = np.arange(1, len(values) + 1)
+    log_map(ax, bands, bands, values.T, "receiver $r$", "source $s$", label, title, floor, top)
+    ax.set_aspect("equal")
     ax.invert_yaxis()
     return ax
 

@@ -18,6 +18,7 @@ from torchchain.cli import choices, outputs
 from torchchain.cli.flags import Predict
 from torchchain.cli.runs import config_of, merged_tables
 from torchchain.energy import StartEnergy, excited, start_energy
+from torchchain.ensemble.labels import time_coordinates
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.scene_file import TIMES, regular_times
 from torchchain.ensemble.stages import Stages
@@ -192,7 +193,6 @@ def _dataset(
     import xarray
 
     axes, units = ("start", "time", "band"), {"units": "energy of the start"}
-    clock = {"units": "travel time of sound over one particle", "long_name": "time t"}
     bands = np.arange(1, master.n_bands + 1)
     told = master.calibration
     origin = "" if told is None else told.provenance if told.scene is None else told.scene.to_toml()
@@ -208,7 +208,7 @@ def _dataset(
         variables,
         coords={
             "start": ("start", labels, {"long_name": "start: source band, or what it is in space"}),
-            "time": ("time", times.numpy(), clock),
+            **time_coordinates(times),
             "band": ("band", bands, {"long_name": plots.BAND_LABEL}),
         },
         attrs={"model": path.name, "calibrated_on": origin},

@@ -8,8 +8,6 @@ displacement did, and the forces on them are the rate of change of momentum ther
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -18,7 +16,7 @@ from torchchain.chain.chain import Chain
 from torchchain.chain.states import Trajectory
 from torchchain.energy.bands import bin_energy, check_bands
 from torchchain.energy.space import checked, require_linear
-from torchchain.energy.wavenumber import band_energy
+from torchchain.energy.wavenumber import band_energy, product, transform, wave_stiffness
 
 
 def kicked(chain: Chain, trajectory: Trajectory) -> Trajectory:
@@ -80,14 +78,12 @@ def kicked_band_energy(
     masses = chain.align(chain.masses, trajectory.velocity)
     # of the velocities, and of the forces, by which the stiffness, diagonal in wavenumber, divides
     wave, moved, force = (
-        torch.fft.rfft(field, norm="ortho")
+        transform(field)
         for field in (trajectory.displacement, masses * trajectory.displacement, masses * trajectory.velocity)
     )
-    k = 2 * math.pi / n * torch.arange(n // 2 + 1, dtype=masses.dtype, device=masses.device)
-    stiffness = chain.contact_stiffness.flatten()[0] * 4 * torch.sin(k / 2).square()
+    stiffness = wave_stiffness(chain)
     stiffness[0] = torch.inf
-    moving = moved.real * wave.real + moved.imag * wave.imag
-    energy = (moving + (force.real.square() + force.imag.square()) / stiffness) / 2
+    energy = (product(moved, wave) + product(force, force) / stiffness) / 2
     energy[..., 1 : (n + 1) // 2] *= 2
     bands = bin_energy(energy, n_bands)
     return bands / energy.sum(-1, keepdim=True) if normalize else bands

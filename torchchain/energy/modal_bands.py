@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -13,6 +12,7 @@ from torchchain.chain.chain import Chain
 from torchchain.chain.states import State
 from torchchain.energy.bands import check_bands
 from torchchain.energy.space import positive, require_linear
+from torchchain.energy.wavenumber import transform, wave_stiffness
 from torchchain.modes.motion import change_basis, modal_motion
 from torchchain.modes.spectrum import NormalModes, normal_modes
 
@@ -57,10 +57,7 @@ def modal_band_energy(
     energy = (change_basis(speed, momentum) * change_basis(speed, wave)) @ bins
     shape = change_basis(position, wave)
     if chain.is_uniform_ring:
-        strain = (
-            chain.contact_stiffness.flatten()[0] * 4 * torch.sin(math.pi / chain.n_particles * tone.to(wave)).square()
-        )
-        energy = energy + shape.square() @ (strain[:, None] * bins)
+        energy = energy + shape.square() @ (wave_stiffness(chain)[tone, None] * bins)
     else:  # -K s_j = w_j^2 M s_j
         force = modes.frequencies.square()[..., :, None] * momentum
         energy = energy + (change_basis(position, force) * shape) @ bins
@@ -70,7 +67,7 @@ def modal_band_energy(
 
 def _real_transform(shapes: Tensor) -> Tensor:
     """Unitary DFT of every mode (*batch, particle, mode) as (*batch, mode, N): real parts, then imaginary parts but zero."""
-    spectrum = torch.fft.rfft(shapes.mT.contiguous(), norm="ortho")
+    spectrum = transform(shapes.mT.contiguous())
     return torch.cat([spectrum.real, spectrum.imag[..., 1:-1]], dim=-1)
 
 

@@ -14,6 +14,7 @@ from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.energy.bands import bin_energy
 from torchchain.energy.space import require_linear, total_energy
+from torchchain.energy.wavenumber import product, transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,13 +112,13 @@ def start_energy(chain: Chain, state: State) -> StartEnergy:
     whole = total_energy(chain, here)[..., 0]
     checks.first_bad("state", "have energy", whole, ~((whole > 0) & whole.isfinite()), "state")
     bound = total_energy(chain, still)[..., 0].clamp(min=0)
-    place, speed = (torch.fft.rfft(field, norm="ortho") for field in (state.displacement, state.velocity))
+    place, speed = transform(state.displacement), transform(state.velocity)
     k = 2 * math.pi / n * torch.arange(n // 2 + 1, dtype=whole.dtype, device=whole.device)
     fold = torch.ones_like(k)
     fold[0] = fold[-1] = 0.5
-    potential = fold * 4 * torch.sin(k / 2).square() * (place.real.square() + place.imag.square())
-    kinetic = fold * (speed.real.square() + speed.imag.square())
-    virial = fold * (place.real * speed.real + place.imag * speed.imag)
+    potential = fold * 4 * torch.sin(k / 2).square() * product(place, place)
+    kinetic = fold * product(speed, speed)
+    virial = fold * product(place, speed)
     stiffness, mass = _ratio(bound, potential.sum(-1)), _ratio(whole - bound, kinetic.sum(-1))
     # What the transforms' rounding leaves at tones without energy is none, nor is a virial of it.
     blurred = 64 * torch.finfo(whole.dtype).eps
@@ -131,9 +132,7 @@ def start_energy(chain: Chain, state: State) -> StartEnergy:
 
 
 def _ratio(part: Tensor, whole: Tensor) -> Tensor:
-    return torch.where(
-        whole > 0, part.clamp(min=0) / whole.clamp(min=torch.finfo(whole.dtype).tiny), torch.zeros_like(whole)
-    )
+    return torch.where(whole > 0, part.clamp(min=0) / whole.clamp(min=torch.finfo(whole.dtype).tiny), 0)
 
 
 def excited(excitation: Any, n_particles: int, dtype: torch.dtype = torch.float64) -> StartEnergy:

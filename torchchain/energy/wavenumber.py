@@ -44,10 +44,8 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
     if definition == "site":
         moving = product(transform(masses * velocity), transform(velocity))
         if chain.is_uniform_ring:
-            k = 2 * math.pi / n * torch.arange(n // 2 + 1, dtype=velocity.dtype, device=velocity.device)
-            strain = chain.contact_stiffness.flatten()[0] * 4 * torch.sin(k / 2).square()
             wave = transform(displacement)
-            bound = strain * product(wave, wave)
+            bound = wave_stiffness(chain) * product(wave, wave)
         else:
             displacement = chain.without_rigid_motion(displacement)
             bound = -product(transform(chain.force(displacement)), transform(displacement))
@@ -66,6 +64,13 @@ def wavenumber_energy(chain: Chain, trajectory: Trajectory, definition: str = "s
 def _require_ring(chain: Chain) -> None:
     if not chain.is_free:  # N + 1 contacts on N wavenumbers: a transform of their own length would not fit
         raise checks.fail("boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary))
+
+
+def wave_stiffness(chain: Chain) -> Tensor:
+    """Stiffness 4 kappa sin^2(k / 2) at |k| = 2 pi n / N, n = 0..N/2, of a ring of equal contacts, (wavenumber,)."""
+    n, masses = chain.n_particles, chain.masses
+    k = 2 * math.pi / n * torch.arange(n // 2 + 1, dtype=masses.dtype, device=masses.device)
+    return chain.contact_stiffness.flatten()[0] * 4 * torch.sin(k / 2).square()
 
 
 def transform(field: Tensor) -> Tensor:

@@ -78,12 +78,10 @@ class Chunk:
         kinds = {entry.kernel for entry in entries}
         if self.scene.lattice is not None or self.scene.by_species:
             return self._of_states(entries)
-        if self.method == "chebyshev" and kinds == {"bands"}:
-            return self._by_kernel(entries, self._bands_by_kernel)
+        if self.method == "chebyshev" and (kinds == {"bands"} or kinds <= MOMENTS):
+            return self._by_kernel(entries)
         if self.layout.fused and "kicked_bands" in kinds:
-            return self._by_kernel(entries, self._kicks_by_kernel)
-        if self.method == "chebyshev" and kinds <= MOMENTS:
-            return self._by_kernel(entries, self._moments_by_kernel)
+            return self._by_kernel(entries)
         if self.method == "modes" and kinds == {"bands"} and self.scene.energy_definition == "site":
             bands = self._bands_by_modes()
             return {entry.name: bands for entry in entries}
@@ -101,26 +99,21 @@ class Chunk:
         )
         return {name: part.embed(name, values) for name, values in inside._in_time(entries).items()}
 
-    def _by_kernel(self, entries: list[Observable], measure: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    def _by_kernel(self, entries: list[Observable]) -> dict[str, Tensor]:
         """From the stencil's kernels, which leave no states behind."""
+        kinds, given = {entry.kernel for entry in entries}, (self._chain, self.state, self.times)
+        n_bands, definition = self.scene.n_bands, self.scene.energy_definition
         with self.stages("evolution with observables"):
             if self.watch is not None:
                 self.watch(self._chain, start(self._chain, self.state, self.method, **self.options)(self.times[-1:]))
-            found = measure()
+            if kinds == {"bands"}:
+                found = {"bands": fused.band_energy(*given, n_bands, True, definition, **self.options)}
+            elif "kicked_bands" in kinds:
+                both = fused.both_band_energies(*given, n_bands, **self.options)
+                found = dict(zip(("bands", "kicked_bands"), both, strict=True))
+            else:
+                found = vars(fused.energy_moments(*given, definition, **self.options))
         return {entry.name: found[entry.kernel] for entry in entries if entry.kernel is not None}
-
-    def _bands_by_kernel(self) -> dict[str, Tensor]:
-        n_bands, definition = self.scene.n_bands, self.scene.energy_definition
-        given = self._chain, self.state, self.times, n_bands, True, definition
-        return {"bands": fused.band_energy(*given, **self.options)}
-
-    def _kicks_by_kernel(self) -> dict[str, Tensor]:
-        given = self._chain, self.state, self.times, self.scene.n_bands
-        return dict(zip(("bands", "kicked_bands"), fused.both_band_energies(*given, **self.options), strict=True))
-
-    def _moments_by_kernel(self) -> dict[str, Tensor]:
-        given = self._chain, self.state, self.times, self.scene.energy_definition
-        return vars(fused.energy_moments(*given, **self.options))
 
     def _bands_by_modes(self) -> Tensor:
         modes, n_bands = self.modes, self.scene.n_bands

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -77,11 +78,5 @@ def quadratic_error(elongation: float, end: float) -> float:
 
 
 def _edge(error: Callable[[float, float], float], end: float, tolerance: float) -> float:
-    top = OPENING if math.isinf(error(1.0, end)) else 1.0
-    if error(top, end) <= tolerance:
-        return top
-    low = 0.0
-    for _ in range(52):  # errors grow with the elongation; loading a solver of SciPy's takes longer than a plan
-        middle = (low + top) / 2
-        low, top = (middle, top) if error(middle, end) <= tolerance else (low, middle)
-    return low
+    step = (OPENING if math.isinf(error(1.0, end)) else 1.0) / 2**52  # errors grow with the elongation
+    return step * (bisect_right(range(2**52 + 1), tolerance, key=lambda i: error(step * i, end)) - 1)

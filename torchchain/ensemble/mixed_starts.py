@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -63,25 +63,26 @@ def fit_transfer(starts: Tensor, energies: Tensor, realization: Tensor) -> Fitte
     condition = condition_of(starts)
     chains = torch.unique(realization)
     blocks = min(MOST_BLOCKS, len(chains))
-    mean = _solved(starts, energies)
-    if blocks < 2:
-        infinite = torch.full_like(mean, torch.inf)
-        return FittedTransfer(mean, infinite, mean[None], (len(chains),), condition)
     parts = chains.tensor_split(blocks)
-    left_out = []
-    for part in parts:
-        kept = ~torch.isin(realization, part)
+
+    def without(block: int) -> Tensor:
+        kept = ~torch.isin(realization, parts[block])
         _check_left(starts, kept, realization)
-        left_out.append(_solved(starts[kept], energies[kept]))
-    return _jackknife(mean, torch.stack(left_out), tuple(len(part) for part in parts), condition)
+        return _solved(starts[kept], energies[kept])
+
+    return _jackknife(_solved(starts, energies), without, tuple(len(part) for part in parts), condition)
 
 
-def _jackknife(mean: Tensor, replicates: Tensor, counts: tuple[int, ...], condition: float) -> FittedTransfer:
-    """The transfer with the error and the pseudo-values of those without one block each."""
+def _jackknife(
+    mean: Tensor, without: Callable[[int], Tensor], counts: tuple[int, ...], condition: float
+) -> FittedTransfer:
+    """The transfer with the error and the pseudo-values of those without one block each; of one block it has none."""
     blocks = len(counts)
-    return FittedTransfer(
-        mean, jackknife_error(replicates), blocks * mean - (blocks - 1) * replicates, counts, condition
-    )
+    if blocks < 2:
+        return FittedTransfer(mean, torch.full_like(mean, torch.inf), mean[None], counts, condition)
+    replicates = torch.stack([without(block) for block in range(blocks)])
+    pseudo = blocks * mean - (blocks - 1) * replicates
+    return FittedTransfer(mean, jackknife_error(replicates), pseudo, counts, condition)
 
 
 def _check_left(starts: Tensor, kept: Tensor, realization: Tensor) -> None:
@@ -149,9 +150,5 @@ def unmixed(block_mean: Tensor, block_counts: Sequence[int]) -> FittedTransfer:
     def solved(energies: Tensor) -> Tensor:
         return torch.linalg.solve(energies[:, 0], energies.flatten(1)).reshape(energies.shape)
 
-    condition = condition_of(total[:, 0])
-    mean, blocks = solved(total), len(counts)
-    if blocks < 2:
-        return FittedTransfer(mean, torch.full_like(mean, torch.inf), mean[None], tuple(block_counts), condition)
-    replicates = torch.stack([solved(total - part) for part in counts * block_mean])
-    return _jackknife(mean, replicates, tuple(block_counts), condition)
+    parts, condition = counts * block_mean, condition_of(total[:, 0])
+    return _jackknife(solved(total), lambda block: solved(total - parts[block]), tuple(block_counts), condition)

@@ -77,10 +77,12 @@ class Ranks:
         with _connected():
             while step < self.size:
                 if self.rank % (2 * step):
-                    _send(moments, self.rank - step)
+                    dist.send_object_list([moments.tensors()], dst=self.rank - step, device=_HOST)
                     break
                 if self.rank + step < self.size:
-                    moments.absorb(_received(moments, self.rank + step))
+                    held: list[Any] = [None]
+                    dist.recv_object_list(held, src=self.rank + step, device=_HOST)
+                    moments.absorb(moments.again(held[0]))
                 step *= 2
         return moments
 
@@ -88,13 +90,7 @@ class Ranks:
         """Rank 0's moments on every rank."""
         if self.size == 1:
             return moments
-        plain = moments.tensors() if self.rank == 0 else {}
-        names = self.agree([(name, tuple(values.shape), values.dtype) for name, values in plain.items()])
-        if self.rank:
-            plain = {name: torch.empty(shape, dtype=dtype) for name, shape, dtype in names}
-        with _connected():
-            for name, _, _ in names:
-                dist.broadcast(plain[name], src=0)
+        plain = self.agree(moments.tensors() if self.rank == 0 else None)
         return moments if self.rank == 0 else moments.again(plain)
 
 
@@ -163,20 +159,3 @@ def _connected() -> Iterator[None]:
         yield
     except RuntimeError as error:
         raise RuntimeError("another process of this run has ended or cannot be reached") from error
-
-
-def _send(moments: EnsembleMoments, to: int) -> None:
-    plain = moments.tensors()
-    names = [(name, tuple(values.shape), values.dtype) for name, values in plain.items()]
-    dist.send_object_list([names], dst=to, device=_HOST)
-    for values in plain.values():
-        dist.send(values, dst=to)
-
-
-def _received(like: EnsembleMoments, source: int) -> EnsembleMoments:
-    held: list[Any] = [None]
-    dist.recv_object_list(held, src=source, device=_HOST)
-    plain = {name: torch.empty(shape, dtype=dtype) for name, shape, dtype in held[0]}
-    for values in plain.values():
-        dist.recv(values, src=source)
-    return like.again(plain)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -142,9 +142,7 @@ def _measured(
     def work(numbers: range) -> tuple[range, Measured, dict[str, float]]:
         spent = Stages(1 / cut.workers)
         chunk = run.chunk(numbers, spent)
-        if run.layout.fused:  # the kernels' bits do not depend on threads
-            return numbers, measure(chunk), spent.seconds
-        with single_thread():
+        with nullcontext() if run.layout.fused else single_thread():  # the kernels' bits do not depend on threads
             return numbers, measure(chunk), spent.seconds
 
     with progress.bar(f"{run.scene.kind}s", every, run.scene.kind, shown, every - wanted) as bar:
@@ -157,11 +155,8 @@ def _measured(
 def _chunks(numbers: Sequence[range], size: int) -> Iterator[range]:
     """The realizations in chunks that end at multiples of a size."""
     for part in numbers:
-        first = part.start
-        while first < part.stop:
-            last = min(part.stop, (first // size + 1) * size)
-            yield range(first, last)
-            first = last
+        for first in range(part.start // size * size, part.stop, size):
+            yield range(max(first, part.start), min(first + size, part.stop))
 
 
 def check_amplitude(scene: Scene) -> None:
@@ -285,13 +280,12 @@ def _collected(
                         writer.save(total)
         if writer is not None and waits:
             writer.close(total)  # the other ranks may take long
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Exception) as error:
         if writer is None:
             raise
-        raise writer.interrupted(total) from None
-    except Exception:
-        if writer is not None:
-            writer.close(total)
+        if isinstance(error, KeyboardInterrupt):
+            raise writer.interrupted(total) from None
+        writer.close(total)
         raise
     return total
 

@@ -20,7 +20,7 @@ from torchchain import checks
 from torchchain.chain.excitation import StandingWave
 from torchchain.ensemble.block_means import QUIET
 from torchchain.ensemble.checkpoint import Checkpoint
-from torchchain.ensemble.labels import ordered_error, tensor_of
+from torchchain.ensemble.labels import ordered_error, tensor_of, time_coordinates
 from torchchain.ensemble.run import ensemble_moments
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import merged
@@ -38,7 +38,8 @@ FINENESS = 4.0
 """Standard errors to the unit to which means are rounded, at least."""
 ERROR_BITS = 4
 """Significant bits of a standard error."""
-KINDS = ("released", "kicked")
+NAMES = ("released", "released_stderr", "kicked", "kicked_stderr")
+KINDS = NAMES[::2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ class StartTransfer:
         object.__setattr__(self, "tones", tones)
         object.__setattr__(self, "samples", checks.integer("starts.samples", self.samples, 1))
         object.__setattr__(self, "times", checks.times("starts.times", self.times))
-        for name in ("released", "released_stderr", "kicked", "kicked_stderr"):
+        for name in NAMES:
             value = checks.real_tensor(f"starts.{name}", getattr(self, name))
             if value.ndim != 3 or tuple(value.shape[:2]) != (len(tones), len(self.times)):
                 rule = f"have the axes [tone, time, receiver] of {len(tones)} tones and {len(self.times)} times"
@@ -92,7 +93,7 @@ class StartTransfer:
         packed = {"zlib": True, "complevel": 5, "shuffle": True}
         found: dict[str, Any] = {
             "start_tone": ("start_tone", np.array(self.tones), {"long_name": "tone of the start"}),
-            "start_time": ("start_time", self.times.numpy(), {"units": "travel time of sound over one particle", "long_name": "time t"}),
+            "start_time": ("start_time", *time_coordinates(self.times)["time"][1:]),
             "start_samples": ((), self.samples, {"units": "1", "long_name": "independent samples"}),
         }  # fmt: skip
         for kind, words in zip(KINDS, ("a wave released at rest", "a wave of velocity"), strict=True):
@@ -108,12 +109,11 @@ class StartTransfer:
             return None
 
         tones = tuple(checks.integer("data.start_tone", tone, 1) for tone in np.atleast_1d(data["start_tone"].values))
-        names = ("released", "released_stderr", "kicked", "kicked_stderr")
         samples = checks.integer(
             "data.start_samples", data["start_samples"].values.tolist() if "start_samples" in data else 0, 1
         )
-        times, *found = (tensor_of(data, name).double() for name in ("start_time", *names))
-        return cls(tones, times, samples=samples, **dict(zip(names, found, strict=True)))
+        times, *found = (tensor_of(data, name).double() for name in ("start_time", *NAMES))
+        return cls(tones, times, samples=samples, **dict(zip(NAMES, found, strict=True)))
 
 
 def start_tones(scene: Scene) -> tuple[int, ...]:
@@ -137,14 +137,9 @@ def start_times(times: Tensor) -> Tensor:
 
 def measurable(scene: Scene) -> bool:
     """Whether other starts of a scene are measured: of undamped, linear rings, in which the energy is quadratic, of enough samples."""
-    linear = (
-        scene.lattice is None
-        and not scene.species
-        and scene.contact == "linear"
-        and scene.damping == 0
-        and scene.boundary == "periodic"
-    )
-    linear = linear and scene.energy_definition == "site"  # by bonds a kick has spread over wavenumbers at once
+    needed = {"lattice": None, "species": (), "contact": "linear", "damping": 0, "boundary": "periodic"}
+    needed["energy_definition"] = "site"  # by bonds a kick has spread over wavenumbers at once
+    linear = all(getattr(scene, name) == value for name, value in needed.items())
     return linear and scene.distinct_realizations // scene.sample_size >= FEWEST
 
 
