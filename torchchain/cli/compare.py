@@ -35,23 +35,18 @@ def run_compare(flags: Compare, arguments: list[str]) -> None:
         (a, first), (b, second) = (_read(name, path) for name, path in (("a", flags.a), ("b", flags.b)))
         found = compare(a, b)
         settings = differing(first, second)
-        figure = _figure(a, b, found)
-        written = outputs.reported(
-            out, arguments, "", "cpu", began, {}, title=f"{flags.a} and {flags.b}", warnings=warned, reasons=REASONS,
+        outputs.leave(
+            out, outputs.figures(_figure(a, b, found), flags.format), arguments, "", "cpu", began, {},
+            title=f"{flags.a} and {flags.b}", warnings=warned, reasons=REASONS,
             compared=[{"path": str(Path(path).resolve())} for path in (flags.a, flags.b)],
-            summary={agreement.variable: _numbers(agreement) for agreement in found},
+            summary={numbers.pop("variable"): numbers for numbers in map(dataclasses.asdict, found)},
             settings={name: [checks.shown(value) for value in pair] for name, pair in settings.items()},
         )  # fmt: skip
-        outputs.write(out, {**outputs.figures(figure, flags.format), **written})
     for name, (one, other) in settings.items():
         print(f"setting {name}: {checks.shown(one)} and {checks.shown(other)}")
     for agreement in found:
         print(agreement)
     print(f"results in {flags.out}")
-
-
-def _numbers(agreement: Agreement) -> dict[str, Any]:
-    return {name: value for name, value in dataclasses.asdict(agreement).items() if name != "variable"}
 
 
 def differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import torch
 
@@ -23,21 +22,17 @@ def run_family(flags: Family, arguments: list[str]) -> None:
     paths = [model_file(path) for path in flags.models]
     outputs.check_apart(flags.out, *paths)
     with outputs.run_folder(flags.out) as out:
-        _join(paths, out, arguments, began)
-
-
-def _join(paths: list[Path], out: Path, arguments: list[str], began: float) -> None:
-    family = MasterFamily([MasterEquation.load(path) for path in paths])
-    times = torch.linspace(0, 500, 101, dtype=torch.float64)[1:]
-    left_out = family.leave_one_out(times)
-    title = f"disorder 0 to {family.strengths[-1]:g}, calibrated at {', '.join(f'{xi:g}' for xi in family.strengths)}"
-    told = "left out and predicted by the others, 0 < t <= 500"
-    written = outputs.reported(
-        out, arguments, "", "cpu", began, {}, title=title, strengths=list(family.strengths), left_out=left_out,
-        models=[{"path": str(path.resolve()), "sha256": outputs.sha256(path)} for path in paths],
-        measured=[(f"total variation at disorder {strength:g}, {told}", off, None) for strength, off in left_out],
-    )  # fmt: skip
-    outputs.write(out, {"model.safetensors": family.save, **written})
+        family = MasterFamily([MasterEquation.load(path) for path in paths])
+        times = torch.linspace(0, 500, 101, dtype=torch.float64)[1:]
+        left_out, strengths = family.leave_one_out(times), family.strengths
+        title = f"disorder 0 to {strengths[-1]:g}, calibrated at {', '.join(f'{xi:g}' for xi in strengths)}"
+        told = "left out and predicted by the others, 0 < t <= 500"
+        outputs.leave(
+            out, {"model.safetensors": family.save}, arguments, "", "cpu", began, {}, title=title,
+            strengths=list(strengths), left_out=left_out,
+            models=[{"path": str(path.resolve()), "sha256": outputs.sha256(path)} for path in paths],
+            measured=[(f"total variation at disorder {strength:g}, {told}", off, None) for strength, off in left_out],
+        )  # fmt: skip
     print(title)
     for strength, distance in left_out:
         print(f"{told}: {strength:g}, total variation {distance:.4f}")

@@ -18,6 +18,15 @@ def flag(values: str | tuple[str, ...], default: Any = None, about: str | None =
     return tyro.conf.arg(metavar=shown, help_behavior_hint=hint, help=about)
 
 
+Figure = Annotated[str, flag(choices.FIGURES, "png", "of the figure, besides PNG")]
+Device = Annotated[str, flag("DEVICE", "cpu", "cpu, cuda, cuda:1, ...")]
+Threads = Annotated[
+    int | None, flag("INT", "all cores, shared by the processes that torchrun starts", "threads of this process")
+]
+Plugin = Annotated[
+    tuple[str, ...], tyro.conf.UseAppendAction,
+    flag("FILE|MODULE", about="registers observables, methods or models of its own; repeatable"),
+]  # fmt: skip
 MEASURED = f"what to measure: {', '.join(choices.OBSERVABLES)}, or of a plugin"
 
 
@@ -111,8 +120,7 @@ class SceneFlags:
     """mixtures: energies in bands of each species, n_bands of them in all"""
     opposite_pairs: Annotated[bool | None, flag(("True", "False"), False)] = None
     """draw chains in pairs of opposite masses: for means that change with the odd part of the disorder, such as widths"""
-    plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()
-    """registers observables, methods or models of its own; repeatable"""
+    plugin: Plugin = ()
 
     def overrides(self) -> dict[str, Any]:
         """The flags of the scene that were given, as nested plain values."""
@@ -125,16 +133,13 @@ class RunFlags(SceneFlags):
     """Flags of the commands that run an ensemble."""
 
     out: Annotated[str, flag("FOLDER")] = "results"
-    format: Annotated[str, flag(choices.FIGURES, "png")] = "png"
-    """of the figure, besides PNG"""
-    device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
-    """cpu, cuda, cuda:1, ..."""
+    format: Figure = "png"
+    device: Device = "cpu"
     method: Annotated[str, flag(("auto", *choices.METHODS), "auto")] = "auto"
     """how to evolve the chains; auto for the plan's choice"""
     checkpoint_every: Annotated[float, flag("SECONDS", 5.0)] = 5.0
     """seconds between saves of finished realizations in the folder, from which the same command goes on"""
-    threads: Annotated[int | None, flag("INT", "all cores, shared by the processes that torchrun starts")] = None
-    """threads of this process"""
+    threads: Threads = None
 
 
 @dataclass(frozen=True)
@@ -174,11 +179,8 @@ class Calibrate(RunFlags):
 
     def calibration(self) -> dict[str, Any]:
         """The flags of the fit that were given."""
-        held = {"method": self.fit, **{name: getattr(self, name) for name in _FIT}}
-        return {name: value for name, value in held.items() if value is not None}
-
-
-_FIT = ("model", "window", "constraint", "penalty", "bootstrap", "starts")
+        names = {"fit": "method"} | {name: name for name in ("model", "window", "constraint", "penalty", "bootstrap", "starts")}
+        return {names[name]: value for name, value in given(self).items() if name in names}
 
 
 @dataclass(frozen=True)
@@ -204,10 +206,8 @@ class Predict:
     """recorded only: a prediction draws no random number"""
     out: Annotated[str, flag("FOLDER", "results/predict")] = "results/predict"
     """for config.toml, results.nc, figure.png, report.html and run.json"""
-    format: Annotated[str, flag(choices.FIGURES, "png")] = "png"
-    """of the figure, besides PNG"""
-    device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
-    """cpu, cuda, cuda:1, ..."""
+    format: Figure = "png"
+    device: Device = "cpu"
     plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()
     """registers models of its own; repeatable"""
 
@@ -258,8 +258,7 @@ class Compare:
     """the other"""
     out: Annotated[str, flag("FOLDER", "results/compare")] = "results/compare"
     """for figure.png, report.html and run.json"""
-    format: Annotated[str, flag(choices.FIGURES, "png")] = "png"
-    """of the figure, besides PNG"""
+    format: Figure = "png"
 
 
 @dataclass(frozen=True)
@@ -276,14 +275,10 @@ class Sweep:
     """seed of every ensemble"""
     out: Annotated[str, flag("FOLDER", "results/sweep")] = "results/sweep"
     """for sweep.nc, sweep.csv, figure.png, report.html, run.json, and the folder of every run in runs"""
-    format: Annotated[str, flag(choices.FIGURES, "png")] = "png"
-    """of the figure, besides PNG"""
-    device: Annotated[str, flag("DEVICE", "cpu")] = "cpu"
-    """cpu, cuda, cuda:1, ..."""
-    threads: Annotated[int | None, flag("INT", "all cores, shared by the processes that torchrun starts")] = None
-    """threads of this process"""
-    plugin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("FILE|MODULE")] = ()
-    """registers observables, methods or models of its own; repeatable"""
+    format: Figure = "png"
+    device: Device = "cpu"
+    threads: Threads = None
+    plugin: Plugin = ()
 
 
 @dataclass(frozen=True)

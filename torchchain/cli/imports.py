@@ -20,6 +20,7 @@ from torchchain.chain.states import Trajectory
 from torchchain.cli import choices, outputs, report
 from torchchain.cli.calibrate import run_calibrate
 from torchchain.cli.flags import Calibrate, Convert, FileFlags, Import
+from torchchain.cli.flags import given as given_flags
 from torchchain.energy.bands import check_bands
 from torchchain.ensemble.provenance import Provenance
 from torchchain.ensemble.stages import Stages
@@ -74,25 +75,15 @@ def run_import(flags: Import, arguments: list[str]) -> None:
         ]  # fmt: skip
         assert transfer.provenance is not None
         hashes = {name: value for name, value in transfer.provenance.hashes.items() if name != "energies"}
-        config = _config(flags, files)
-        condition = transfer.attributes["start_condition"]
-        starts = (
-            f"starts: {'one band each' if condition == 1 else f'mixed, least squares of condition {condition:.3g}'}"
-        )
-        written = outputs.reported(
-            out, arguments, config, "cpu", began, stages.seconds, runs=runs, inputs=hashes, summary=transfer.attributes,
+        config, condition = _config(flags, files), transfer.attributes["start_condition"]
+        mixed = "one band each" if condition == 1 else f"mixed, least squares of condition {condition:.3g}"
+        starts = f"starts: {mixed}"
+        files_left = {"transfer.nc": outputs.dataset(transfer.to_dataset()), **outputs.figures(figure, flags.figure)}
+        outputs.leave(
+            out, files_left, arguments, config, "cpu", began, stages.seconds, runs=runs, inputs=hashes, summary=transfer.attributes,
             title=transfer.provenance.words, reasons=[*map(str, frames[:1]), starts], warnings=warned,
             measured=report.shares_left(transfer, shown_bands(transfer.n_bands)),
         )  # fmt: skip
-        outputs.write(
-            out,
-            {
-                "config.toml": outputs.text(config),
-                "transfer.nc": outputs.dataset(transfer.to_dataset()),
-                **outputs.figures(figure, flags.figure),
-                **written,
-            },
-        )
     print(transfer)
     print("masses: mean {mass_mean:.5f}, standard deviation {mass_sd:.5f}".format(**transfer.attributes))
     print(starts)
@@ -122,9 +113,7 @@ def _each_doubt_once() -> Iterator[None]:
 
 def _config(flags: Import, files: list[RunFiles]) -> str:
     """The flags as TOML, by which the import can be made again from any folder."""
-    given = {
-        name: value for name, value in vars(flags).items() if value is not None and name not in ("out", "calibrate")
-    }
+    given = {name: value for name, value in given_flags(flags).items() if name not in ("out", "calibrate")}
     for name in ("reference", "contacts", "masses"):
         place = Path(given.get(name, ""))
         if place.parent != Path() or (name == "masses" and place.is_file()):
@@ -166,18 +155,15 @@ def files_of(flags: Import) -> list[RunFiles]:
     runs = [path for path in paths if path.resolve() not in at_rest]
     if not runs:
         raise checks.fail("runs", "be others than their references", str(paths[0]))
+    found = []
     for path in runs:
-        reference = references[path]
-        if reference is not None and not reference.is_file():
-            raise checks.fail("reference", f"be a file beside {path.name}", f"no file {reference}")
-    contacts = {
-        path: None if flags.contacts is None else str(_beside("contacts", flags.contacts, path.absolute()))
-        for path in runs
-    }
-    return [
-        RunFiles(path.absolute(), found if found is None else found.absolute(), contacts[path])
-        for path, found in ((path, references[path]) for path in runs)
-    ]
+        rest, contacts = references[path], None
+        if rest is not None and not rest.is_file():
+            raise checks.fail("reference", f"be a file beside {path.name}", f"no file {rest}")
+        if flags.contacts is not None:
+            contacts = str(_beside("contacts", flags.contacts, path.absolute()))
+        found.append(RunFiles(path.absolute(), rest if rest is None else rest.absolute(), contacts))
+    return found
 
 
 def _reference(template: str | None, run: Path) -> Path | None:
@@ -291,11 +277,8 @@ def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Ch
         damping = damping * units.unit("time") / units.unit("mass")
         stiffness = stiffness if isinstance(stiffness, str) else stiffness / units.unit("stiffness")
     if line_axis(frames[0].first, flags.axis) is None:
-        grains = [
-            each.network(run.reference, stiffness=stiffness, contact=flags.contact, damping=damping)
-            for run, each in zip(files, frames, strict=True)
-        ]
-        return frames, grains
+        how: dict[str, Any] = {"stiffness": stiffness, "contact": flags.contact, "damping": damping}
+        return frames, [each.network(run.reference, **how) for run, each in zip(files, frames, strict=True)]
     chains = []
     for run, each in zip(files, frames, strict=True):
         chains.append(each.chain(flags.boundary, stiffness, axis=flags.axis, damping=damping, reference=run.reference))
@@ -346,15 +329,9 @@ def _transfer(
     log.info("band energies of %s", first)
     late = "late" if flags.long_time == "late" else None
     try:
-        return BandTransfer.from_trajectories(
-            chains,
-            trajectories(),
-            _n_bands(flags, chains[0]),
-            late,
-            Provenance("imported", words, hashes),
-            [run.path.name for run in files],
-            flags.largest,
-        )
+        origin, names = Provenance("imported", words, hashes), [run.path.name for run in files]
+        n_bands = _n_bands(flags, chains[0])
+        return BandTransfer.from_trajectories(chains, trajectories(), n_bands, late, origin, names, flags.largest)
     except checks.FieldError as error:
         if flags.reference is not None or ": total energy" not in str(error):
             raise

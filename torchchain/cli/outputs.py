@@ -284,6 +284,15 @@ def reported(
     return {report.REPORT: page, RECORD: writer}
 
 
+def leave(
+    out: Path, files: dict[str, Writer], arguments: Sequence[str], config: str, device: str, began: float,
+    stages: dict[str, float], **more: Any,
+) -> None:  # fmt: skip
+    """Write the config if there is one, the files, and what :func:`reported` gives of the rest."""
+    written = reported(out, arguments, config, device, began, stages, **more)
+    write(out, {**({"config.toml": text(config)} if config else {}), **files, **written})
+
+
 def sha256(path: str | Path) -> str:
     """SHA-256 of a file, hexadecimal."""
     with open(path, "rb") as file:

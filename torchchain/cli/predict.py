@@ -43,45 +43,31 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
     checks.choice("format", flags.format, choices.FIGURES)
     outputs.check_apart(flags.out, flags.model)
     with outputs.run_folder(flags.out) as out, outputs.told_warnings() as warned:
-        _predict(flags, given, loaded, out, device, arguments, began, warned)
-
-
-def _predict(
-    flags: Predict, given: Mapping[str, Any], loaded: list[str], out: Path, device: str, arguments: list[str],
-    began: float, warned: list[str],
-) -> None:  # fmt: skip
-    stages, path = Stages(), model_file(flags.model)
-    with stages("loading"):
-        master = _loaded(path, given.get("strength")).to(device)
-        digest = outputs.sha256(path)
-    times = _times(given.get("times", {}))
-    starts, labels, request = _starts(given, master)
-    with stages("prediction"):
-        energy = master.solve(starts.given, times, method=flags.method).detach().cpu()
-    data = _dataset(master, path, starts, labels, times, energy)
-    if "strength" in given:
-        request["strength"] = float(given["strength"])
-    if loaded:
-        request["plugins"] = loaded
-    text = tomli_w.dumps({**request, "times": times.tolist()})
-    written = outputs.reported(
-        out, arguments, text, device, began, stages.seconds, seed=flags.seed, method=flags.method, warnings=warned,
-        model={"path": str(path.resolve()), "sha256": digest},
-        title=f"prediction of {len(labels)} start{'s' * (len(labels) > 1)} to t = {float(times[-1]):g}",
-        reasons=[f"solved by {flags.method}", *repr(master).splitlines()[1:]],
-    )  # fmt: skip
-    files = {
-        "config.toml": outputs.text(text),
-        "results.nc": outputs.dataset(data),
-        **outputs.figures(_figure(starts, labels, times, energy), flags.format),
-        **written,
-    }
-    outputs.write(out, files)
-    print(f"{len(labels)} start{'s' * (len(labels) > 1)}, {len(times)} times to {float(times[-1]):g}, solved by {flags.method}")
+        stages, path = Stages(), model_file(flags.model)
+        with stages("loading"):
+            master = _loaded(path, given.get("strength")).to(device)
+            digest = outputs.sha256(path)
+        times = _times(given.get("times", {}))
+        starts, labels, request = _starts(given, master)
+        with stages("prediction"):
+            energy = master.solve(starts.given, times, method=flags.method).detach().cpu()
+        data = _dataset(master, path, starts, labels, times, energy)
+        if "strength" in given:
+            request["strength"] = float(given["strength"])
+        if loaded:
+            request["plugins"] = loaded
+        text, count = tomli_w.dumps({**request, "times": times.tolist()}), f"{len(labels)} start{'s' * (len(labels) > 1)}"
+        drawn = outputs.figures(_figure(starts, labels, times, energy), flags.format)
+        outputs.leave(
+            out, {"results.nc": outputs.dataset(data), **drawn}, arguments, text, device, began, stages.seconds,
+            seed=flags.seed, method=flags.method, warnings=warned, model={"path": str(path.resolve()), "sha256": digest},
+            title=f"prediction of {count} to t = {float(times[-1]):g}",
+            reasons=[f"solved by {flags.method}", *repr(master).splitlines()[1:]],
+        )  # fmt: skip
+    print(f"{count}, {len(times)} times to {float(times[-1]):g}, solved by {flags.method}")
     gone = starts.gone(master, times)
-    print(
-        f"largest change of total energy: {float((energy.sum(-1) + gone - starts.bands.sum(-1)[:, None]).abs().max()):.3g}"
-    )
+    change = float((energy.sum(-1) + gone - starts.bands.sum(-1)[:, None]).abs().max())
+    print(f"largest change of total energy: {change:.3g}")
     if bool(starts.rest.any()):
         print(f"energy at k = 0, which stays there and is in no band: {float(starts.rest.max()):.3g}")
     if bool(gone.any()):
@@ -199,11 +185,8 @@ def _dataset(
     variables = {"band_energy": (axes, energy.numpy(), {**units, "long_name": "energy in a band"})}
     if master.uncertainty is not None:
         error = master.standard_error(starts.given, times).cpu().numpy()
-        variables["band_energy_stderr"] = (
-            axes,
-            error,
-            {**units, "long_name": "standard error of the energy in a band"},
-        )
+        label = {**units, "long_name": "standard error of the energy in a band"}
+        variables["band_energy_stderr"] = (axes, error, label)
     return xarray.Dataset(
         variables,
         coords={

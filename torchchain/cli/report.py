@@ -208,26 +208,18 @@ def _done(record: Mapping[str, Any]) -> list[str]:
     """Method, reasons, forecast and the time of every stage."""
     rows: list[tuple[str, Any]] = []
     if "resolved" in record:
-        options = ", ".join(f"{name} = {value}" for name, value in record["resolved"]["options"].items())
-        rows.append(("method", record["resolved"]["method"] + (f", {options}" if options else "")))
-    for name, key in (("seed", "seed"), ("device", "device"), ("threads", "threads"), ("processes", "processes")):
-        if record.get(key) is not None:
-            rows.append((name, record[key]))
+        options = [f"{name} = {value}" for name, value in record["resolved"]["options"].items()]
+        rows.append(("method", ", ".join([record["resolved"]["method"], *options])))
+    rows += [(name, record[name]) for name in ("seed", "device", "threads", "processes") if record.get(name) is not None]
     forecast = record.get("forecast") or {}
-    for name in ("predicted_error", "statistical_error", "predicted_seconds", "seconds"):
-        if name in forecast:
-            rows.append((FORECAST[name], forecast[name]))
+    rows += [(words, forecast[name]) for name, words in FORECAST.items() if name in forecast]
     for what in ("transfer", "model"):
         if isinstance(record.get(what), Mapping):
             rows.append((f"{what} from", record[what].get("path", "")))
-    parts = (
-        [f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in record['reasons'])}</ul>"]
-        if record.get("reasons")
-        else []
-    )
-    parts.append(_table(rows))
+    reasons = "".join(f"<li>{_text(line)}</li>" for line in record.get("reasons") or ())
+    parts = [f"<ul>{reasons}</ul>", _table(rows)] if reasons else [_table(rows)]
     if record["stages"]:
-        parts += [_table(record["stages"].items(), ("stage", "seconds"))]
+        parts.append(_table(record["stages"].items(), ("stage", "seconds")))
     versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
     return [*parts, f"<p>{_text(versions)}; {_text(record['machine'])}</p>"]
 

@@ -25,7 +25,6 @@ from torchchain.ensemble import ranks
 from torchchain.ensemble.scene_file import read_toml
 from torchchain.results import read_dataset
 
-COMMANDS = ("simulate", "calibrate", "predict", "import")
 DATA = {
     "simulate": ("results.nc",),
     "calibrate": ("transfer.nc", "model.safetensors"),
@@ -36,9 +35,9 @@ NEEDED: dict[str, type] = {"files": dict, "versions": dict, "device": str, "conf
 NEEDED_OF: dict[str, dict[str, type]] = {
     "predict": {"method": str, "model.path": str, "model.sha256": str},
     "import": {"inputs": dict},
+    "ensemble": {"resolved.method": str, "resolved.options": dict},
+    "transfer": {"transfer.path": str, "transfer.sha256": str},
 }
-NEEDED_OF_ENSEMBLE: dict[str, type] = {"resolved.method": str, "resolved.options": dict}
-NEEDED_OF_TRANSFER: dict[str, type] = {"transfer.path": str, "transfer.sha256": str}
 SAID_ELSEWHERE = ("torchchain_version",)  # attributes that the record's versions hold
 
 
@@ -85,11 +84,10 @@ def read_record(folder: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise checks.fail(f"{where}/run.json", "be JSON", str(error)) from None
     arguments = record.get("arguments") if isinstance(record, dict) else None
-    if not isinstance(arguments, list) or not arguments or arguments[0] not in COMMANDS or "files" not in record:
-        raise checks.fail(where, f"hold a run of {', '.join(COMMANDS)}", checks.shown(arguments))
-    source = NEEDED_OF_TRANSFER if "transfer" in record else NEEDED_OF_ENSEMBLE
-    needed = NEEDED | NEEDED_OF.get(arguments[0], source)
-    for name, kind in needed.items():
+    if not isinstance(arguments, list) or not arguments or arguments[0] not in DATA or "files" not in record:
+        raise checks.fail(where, f"hold a run of {', '.join(DATA)}", checks.shown(arguments))
+    source = NEEDED_OF["transfer" if "transfer" in record else "ensemble"]
+    for name, kind in (NEEDED | NEEDED_OF.get(arguments[0], source)).items():
         held: Any = record
         for key in name.split("."):
             held = held.get(key) if isinstance(held, dict) else None
@@ -115,32 +113,24 @@ def _place(out: str | None) -> Iterator[Path]:
 
 def _again(record: Mapping[str, Any], folder: Path, out: Path, flags: Rerun) -> None:
     """The recorded command with the resolved config, method and options."""
-    config, place = str(folder / "config.toml"), str(out)
+    arguments, keep, resolved = record["arguments"], flags.out is not None, record.get("resolved", {})
     device = flags.device or record["device"].partition(": ")[0]
+    how: dict[str, Any] = {"config": str(folder / "config.toml"), "out": str(out), "device": device}
     with contextlib.redirect_stdout(io.StringIO()):
-        if record["arguments"][0] == "import":
+        if arguments[0] == "import":
             for path, digest in record["inputs"].items():
                 _same_file("inputs", {"path": path, "sha256": digest})
             words = read_toml(folder / "config.toml")
-            run_import(Import(**words | {"runs": tuple(words["runs"]), "out": place}), record["arguments"])
-            return
-        if record["arguments"][0] == "predict":
+            run_import(Import(**words | {"runs": tuple(words["runs"]), "out": str(out)}), arguments)
+        elif arguments[0] == "predict":
             model = _same_file("model", record["model"])
-            request = Predict(
-                model=model, config=config, out=place, device=device, method=record["method"], seed=record["seed"]
-            )
-            run_predict(request, record["arguments"])
-            return
-        if "transfer" in record:
-            transfer = _same_file("transfer", record["transfer"])
-            run_calibrate(Calibrate(config=config, out=place, device=device, transfer=transfer), record["arguments"])
-            return
-        resolved, keep = record["resolved"], flags.out is not None
-        how = {"config": config, "out": place, "device": device, "method": resolved["method"]}
-        if record["arguments"][0] == "simulate":
-            run_simulate(Simulate(**how), record["arguments"], resolved["options"], keep)
+            run_predict(Predict(model, method=record["method"], seed=record["seed"], **how), arguments)
+        elif "transfer" in record:
+            run_calibrate(Calibrate(transfer=_same_file("transfer", record["transfer"]), **how), arguments)
+        elif arguments[0] == "simulate":
+            run_simulate(Simulate(method=resolved["method"], **how), arguments, resolved["options"], keep)
         else:
-            run_calibrate(Calibrate(**how), record["arguments"], resolved["options"], keep)
+            run_calibrate(Calibrate(method=resolved["method"], **how), arguments, resolved["options"], keep)
 
 
 def _same_file(name: str, recorded: Mapping[str, str]) -> str:

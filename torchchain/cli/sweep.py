@@ -61,6 +61,7 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
     fields = swept(flags.fields)
     checks.device("device", flags.device)
     points = list(combinations(fields, config))
+    title = f"{len(points)} runs of {flags.command} over {', '.join(fields)}"
     for point in points:  # all of them before the first is run
         tables = ("plugins", *(["calibration"] if flags.command == "calibrate" else []))
         Scene.from_dict({name: value for name, value in point.config.items() if name not in tables})
@@ -89,23 +90,20 @@ def run_sweep(flags: Sweep, arguments: list[str]) -> None:
         text = tomli_w.dumps({**config, "sweep": {name: list(values) for name, values in fields.items()}})
         with plots.style():
             figure = _figure(fields, panels(data, [folder.record for folder in folders]))
-        written = outputs.reported(
-            out, arguments, text, flags.device, began, {}, seed=config.get("seed", 0), runs=[point.name for point in points],
-            title=f"{len(points)} runs of {flags.command} over {', '.join(fields)}", warnings=warned,
+        files = {
+            "sweep.nc": outputs.dataset(data), "sweep.csv": outputs.text(_table(fields, points, rows)),
+            **outputs.figures(figure, flags.format),
+        }  # fmt: skip
+        outputs.leave(
+            out, files, arguments, text, flags.device, began, {}, seed=config.get("seed", 0),
+            runs=[point.name for point in points], title=title, warnings=warned,
             measured=[
                 (f"{_varied(fields, point)}: {name}", value, error)
                 for point, folder in zip(points, folders, strict=True) for name, value, error in folder.record.get("measured") or ()
             ],
             reasons=["every run has a report of its own in the folder runs", *left_out(data)],
         )  # fmt: skip
-        outputs.write(out, {
-            "config.toml": outputs.text(text), "sweep.nc": outputs.dataset(data),
-            "sweep.csv": outputs.text(_table(fields, points, rows)), **outputs.figures(figure, flags.format),
-            **written,
-        })  # fmt: skip
-    print(
-        f"{len(points)} runs of {flags.command} over {', '.join(fields)}; {time.time() - began:.1f} s, results in {flags.out}"
-    )
+    print(f"{title}; {time.time() - began:.1f} s, results in {flags.out}")
 
 
 @contextmanager
@@ -226,12 +224,10 @@ def left_out(data: xarray.Dataset) -> list[str]:
 
 def _table(fields: Mapping[str, Any], points: Sequence[Point], rows: Sequence[Mapping[str, float]]) -> str:
     """The runs as comma-separated values: swept fields, then the numbers that sum them up."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*fields, *names])
-    for point, row in zip(points, rows, strict=True):
-        writer.writerow([*point.values, *(row.get(name, "") for name in names)])
+    writer = csv.DictWriter(text, dict.fromkeys([*fields, *itertools.chain(*rows)]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({**dict(zip(fields, point.values, strict=True)), **row} for point, row in zip(points, rows, strict=True))
     return text.getvalue()
 
 
@@ -279,10 +275,7 @@ def _figure(fields: Mapping[str, Sequence[Any]], shown: Mapping[str, tuple[np.nd
             error = None if errors is None else errors[at]
             ax.errorbar(x, values[at], error, marker="os^vDP*"[i % 7], label=label or None)
         ax.set(xlabel=first, ylabel=textwrap.fill(name, 32))
-        if numeric:
-            ax.set_xticks(list(x), [f"{value:g}" for value in x])
-        else:
-            ax.set_xticks(list(x), [str(value) for value in fields[first]])
+        ax.set_xticks(list(x), [f"{value:g}" if numeric else str(value) for value in fields[first]])
     if varied and shown:
         figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     for ax in list(axes.flat)[len(shown) :]:

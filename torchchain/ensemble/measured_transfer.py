@@ -132,14 +132,8 @@ def _by_species(transfer: BandTransfer, moments: EnsembleMoments) -> BandTransfe
 def measured_observables(scene: Scene, long_time: bool = True) -> tuple[str, ...]:
     """What is measured on every realization of a band transfer: of large lattices no long-time average, which takes all modes."""
     exact = scene.lattice is None or scene.n_particles * scene.n_components <= MOST_UNKNOWNS
-    return (
-        "band_energy",
-        *(
-            ("long_time_band_energy",)
-            if long_time and exact and not scene.by_species and scene.largest_damping == 0
-            else ()
-        ),
-    )
+    exact = exact and long_time and not scene.by_species and scene.largest_damping == 0
+    return ("band_energy", "long_time_band_energy") if exact else ("band_energy",)
 
 
 def with_late_average(transfer: BandTransfer) -> BandTransfer:
@@ -148,13 +142,8 @@ def with_late_average(transfer: BandTransfer) -> BandTransfer:
     blocks, _ = late_average(transfer.times, transfer.block_mean)
     weights = torch.tensor(transfer.block_counts, dtype=blocks.dtype)[:, None, None]
     squares = (weights * (blocks - average).square()).sum(0)
-    error = (
-        (squares / weights.sum() / max(len(blocks) - 1, 1)).sqrt()
-        if len(blocks) > 1
-        else torch.full_like(squares, torch.inf)
-    )
-    if transfer.is_ordered:
-        error = torch.zeros_like(squares)
+    error = (squares / weights.sum() / (len(blocks) - 1)).sqrt() if len(blocks) > 1 else torch.full_like(squares, torch.inf)
+    error = torch.zeros_like(squares) if transfer.is_ordered else error
     stderr = (error.square() + unsettled.square()).sqrt()
     return replace(transfer, long_time=average[0], long_time_stderr=stderr, block_long_time=blocks)
 

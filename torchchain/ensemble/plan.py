@@ -304,9 +304,8 @@ def _tolerance(scene: Scene) -> tuple[float, list[str]]:
     if scene.is_ordered:
         return ORDERED_TOLERANCE, [f"no tolerance asked for and no ensemble error: {ORDERED_TOLERANCE:.0e}"]
     noise = statistical_error(scene)
-    return FRACTION_OF_NOISE * noise, [
-        f"no tolerance asked for: a third of the ensemble's own error, about {noise:.1e}"
-    ]
+    why = f"no tolerance asked for: a third of the ensemble's own error, about {noise:.1e}"
+    return FRACTION_OF_NOISE * noise, [why]
 
 
 def _settled(
@@ -317,15 +316,8 @@ def _settled(
         return scene, facts, [f"lattices of {facts.n} unknowns and {facts.n_bonds} bonds"], 0.0
     size = f"elongation about {facts.elongation:.1e} of the overlap, force off by {100 * facts.deviation:.1e} %"
     if scene.contact != "auto":
-        return (
-            scene,
-            facts,
-            [
-                f"{scene.contact.capitalize()} contacts asked for: {size}"
-                + (" by linear ones" if scene.contact == "hertz" else " from Hertz contacts")
-            ],
-            0.0,
-        )
+        other = " by linear ones" if scene.contact == "hertz" else " from Hertz contacts"
+        return scene, facts, [f"{scene.contact.capitalize()} contacts asked for: {size}{other}"], 0.0
     off = facts.accumulated
     growing = f"{size} and energies by up to {off:.1e} at the last time"
     if off <= CONTACT_FRACTION * tolerance:

@@ -137,6 +137,9 @@ class BandTransfer(Printed):
         known = "not known"
         if self.long_time is not None and self.long_time_stderr is not None:
             known = f"standard error up to {self.long_time_stderr.max():.1e}"
+        starts = {}
+        if self.starts is not None:
+            starts["starts"] = f"{len(self.starts.tones)} tones released and kicked, {self.starts.samples} samples"
         method = {"evolved by": str(self.attributes["method"])} if "method" in self.attributes else {}
         return {
             "origin": " ".join(filter(None, (f"{self.provenance.kind}:", self.provenance.words or "not told"))),
@@ -145,11 +148,7 @@ class BandTransfer(Printed):
             "samples": f"{sum(self.block_counts)} in {len(self.block_counts)} blocks",
             "mean": f"standard error up to {self.stderr.max():.1e}",
             "long_time": known,
-            **(
-                {"starts": f"{len(self.starts.tones)} tones released and kicked, {self.starts.samples} samples"}
-                if self.starts
-                else {}
-            ),
+            **starts,
             **method,
         }
 

@@ -35,8 +35,9 @@ def dataset_of(transfer: BandTransfer) -> xarray.Dataset:
     s, t, r, b = "source", "time", "receiver", "block"
     variables: dict[str, Any] = {}
 
-    def put(name: str, axes: tuple[str, ...], values: Tensor, label: str) -> None:
-        variables[name] = (axes, values.numpy(), {"units": "1", "long_name": label})
+    def put(name: str, axes: tuple[str, ...], values: Tensor | None, label: str) -> None:
+        if values is not None:
+            variables[name] = (axes, values.numpy(), {"units": "1", "long_name": label})
 
     put("band_energy", (s, t, r), transfer.mean, "share of the energy in the receiving band")
     put("band_energy_stderr", (s, t, r), transfer.stderr, "its standard error")
@@ -47,16 +48,11 @@ def dataset_of(transfer: BandTransfer) -> xarray.Dataset:
         label = {"units": "1", "long_name": "block means as integers, which BandTransfer.load understands"}
         variables["block_steps"] = ((b, s, t, r), whole, label, {"zlib": True, "complevel": 4})
     put("block_count", (b,), torch.tensor(transfer.block_counts), "realizations in a block")
-    if (
-        transfer.long_time is not None
-        and transfer.long_time_stderr is not None
-        and transfer.block_long_time is not None
-    ):
+    if transfer.long_time is not None:
         put("long_time", (s, r), transfer.long_time, "infinite-time average of the share")
         put("long_time_stderr", (s, r), transfer.long_time_stderr, "its standard error")
         put("block_long_time", (b, s, r), transfer.block_long_time, "block means")
-    if transfer.systematic is not None:
-        put("systematic", (s, t), transfer.systematic, "estimated total variation distance from an endless ensemble")
+    put("systematic", (s, t), transfer.systematic, "estimated total variation distance from an endless ensemble")
     if transfer.starts is not None:
         variables |= transfer.starts.variables()
     bands = np.arange(1, transfer.n_bands + 1)
@@ -86,9 +82,8 @@ def fields_of(data: xarray.Dataset) -> dict[str, Any]:
     for name in (*needed, *late):
         if name not in data:
             raise checks.fail("data", f"hold the variable {name} of a band transfer", f"{', '.join(map(str, data))}")
-    attributes = {
-        name: data.attrs[name] for name in ("method", "method_options", "start_condition") if name in data.attrs
-    }
+    kept = ("method", "method_options", "start_condition")
+    attributes = {name: data.attrs[name] for name in kept if name in data.attrs}
     scene = None
     if "scene" in data.attrs or "provenance_kind" not in data.attrs:
         scene, moments = _scene_of(data)
@@ -97,7 +92,6 @@ def fields_of(data: xarray.Dataset) -> dict[str, Any]:
         attributes |= {name: checks.number(f"data.{name}", data.attrs[name]) for name in OF_RUNS if name in data.attrs}
 
     tensor = partial(tensor_of, data)
-    held = "long_time" in data
     mean, stderr = tensor("band_energy"), tensor("band_energy_stderr")
     counts = tuple(checks.integer("data.block_count", n, 1) for n in np.atleast_1d(data["block_count"].values))
     return {
@@ -105,10 +99,8 @@ def fields_of(data: xarray.Dataset) -> dict[str, Any]:
         "times": tensor("time") if scene is None else scene.times,
         "mean": mean,
         "stderr": stderr,
-        "long_time": tensor("long_time") if held else None,
-        "long_time_stderr": tensor("long_time_stderr") if held else None,
+        **{name: tensor(name) if late else None for name in ("long_time", "long_time_stderr", "block_long_time")},
         "block_mean": _decoded(data, mean, stderr, counts) if whole else tensor("block_band_energy"),
-        "block_long_time": tensor("block_long_time") if held else None,
         "block_counts": counts,
         "attributes": attributes,
         "provenance": _provenance_of(data),

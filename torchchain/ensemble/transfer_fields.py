@@ -74,16 +74,17 @@ def from_energies(
         checks.first_bad("starts", "not be negative by more than a tenth", starts, starts < -0.1, "realization")
         late = None if long_time is None else checks.real_tensor("long_time", long_time).cpu().double()
         per_run = late is not None and late.ndim == 3
-        if late is not None and per_run:
-            if tuple(late.shape) != expected:
-                raise checks.fail(
-                    "long_time", f"have shape {expected[2:] * 2} or {expected}", f"shape {tuple(late.shape)}"
-                )
-            late = late.flatten(0, 1)
+        if late is not None and late.ndim == 3:
+            late = _shaped(late, expected, expected[2:] * 2).flatten(0, 1)
         realization = torch.arange(len(energies)).repeat_interleave(energies.shape[1])
         flat = starts.flatten(0, 1), energies.flatten(0, 1)
         return of_runs(times, *flat, late, realization, provenance, per_run)
-    average, unsettled = late_average(times, energies) if long_time is None else _given_average(energies, long_time)
+    if long_time is None:
+        average, unsettled = late_average(times, energies)
+    else:
+        shape = (len(energies), energies.shape[1], energies.shape[3])
+        average = _shaped(checks.real_tensor("long_time", long_time).cpu().double(), shape, shape[1:]).expand(shape)
+        unsettled = torch.zeros(shape[1:], dtype=torch.float64)
     moments = EnsembleMoments(len(energies), min(BLOCKS, len(energies)))
     moments.add(0, {"band_energy": energies, "long_time_band_energy": average})
     found = of_moments(None, times, moments, {}, provenance)
@@ -129,7 +130,7 @@ def of_runs(
         late: with ``per_run`` (run, band); else (source, receiver), which is taken as exact; None for the later half of
             the times.
     """
-    n, ends = energies.shape[2], [energies[:, :0]]
+    n, count, ends = energies.shape[2], len(times), [energies[:, :0]]
     if late is None:
         later = energies[:, 2 * times >= times[-1]]
         halves = [part if part.shape[1] else later for part in later.tensor_split(2, dim=1)]
@@ -139,11 +140,10 @@ def of_runs(
     elif tuple(late.shape) != (n, n):
         raise checks.fail("long_time", f"have shape {(n, n)} (source, receiver)", f"shape {tuple(late.shape)}")
     found = fit_transfer(starts, torch.cat([energies, *ends], 1), realization)
-    count = len(times)
-    given = late is not None and not per_run
-    average = late if given else found.mean[:, count]
-    error = torch.zeros(n, n, dtype=torch.float64) if given else found.stderr[:, count]
-    blocks = found.block_mean[:, :, count] if not given else torch.as_tensor(late).expand(len(found.block_counts), n, n)
+    if late is not None and not per_run:
+        average, error, blocks = late, torch.zeros_like(late), late.expand(len(found.block_counts), n, n)
+    else:
+        average, error, blocks = found.mean[:, count], found.stderr[:, count], found.block_mean[:, :, count]
     if late is None:
         unsettled = (found.mean[:, count + 2] - found.mean[:, count + 1]) / 2
         error = (error.square() + unsettled.square()).sqrt()
@@ -156,13 +156,12 @@ def of_runs(
     }  # fmt: skip
 
 
-def _given_average(energies: Tensor, long_time: Any) -> tuple[Tensor, Tensor]:
-    """A given long-time average of every realization, and what else it may be off by: nothing."""
-    given = checks.real_tensor("long_time", long_time).cpu().double()
-    shape = (len(energies), energies.shape[1], energies.shape[3])
-    if tuple(given.shape) not in (shape, shape[1:]):
-        raise checks.fail("long_time", f"have shape {shape[1:]} or {shape}", f"shape {tuple(given.shape)}")
-    return given.expand(shape), torch.zeros(shape[1:], dtype=torch.float64)
+def _shaped(late: Tensor, *shapes: tuple[int, ...]) -> Tensor:
+    """A long-time average that is given, of one of the shapes."""
+    if tuple(late.shape) not in shapes:
+        rule = f"have shape {' or '.join(str(shape) for shape in reversed(shapes))}"
+        raise checks.fail("long_time", rule, f"shape {tuple(late.shape)}")
+    return late
 
 
 def late_average(times: Tensor, energies: Tensor) -> tuple[Tensor, Tensor]:
