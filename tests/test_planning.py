@@ -254,7 +254,7 @@ def test_hertz_by_amplitude_has_no_bands():
     wanted = scene(contact="auto", tolerance=1e-6, excitation=waves, observables=("band_energy",), n_bands=4)
     with pytest.raises(FieldError, match=r"contact must be 'linear' for the observable band_energy"):
         tc.simulate(wanted)
-    with pytest.raises(FieldError, match=r"got 'auto' and elongation about 1.0e\+00 of the overlap, .*, 1.0e-06 allowed"):
+    with pytest.raises(FieldError, match=r"got 'auto' and elongation about .* of the overlap, .*, 1.0e-06 allowed"):
         tc.plan(wanted)
 
 
