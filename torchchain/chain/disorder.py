@@ -14,7 +14,7 @@ from torchchain import checks
 from torchchain.memory import gigabytes, memory
 
 KINDS = ("normal", "uniform", "binary", "lognormal", "gamma")
-LARGEST_CHAIN = 10**8
+LARGEST_CHAIN = 10**8  # particles
 _MASSES, _STIFFNESSES = 0, 1  # the random streams of a realization
 _NEGLIGIBLE = 1e-20  # a strength below the resolution of a float64 next to 1
 

@@ -36,7 +36,7 @@ from torchchain.locks import lock
 from torchchain.progress import log
 
 FORMAT = "torchchain-checkpoint-1"
-EVERY = 5.0
+EVERY = 5.0  # seconds between saves
 SAVING = 20  # takes at most one part in so many of the time
 _NAME = re.compile(r"(\d{5})-(\d{5}|base)\.safetensors")
 

@@ -16,7 +16,7 @@ OPENING = 0.2
 # in proportion to the energy, and what resonant triads move, at a rate in proportion to the energy until it is spread: to 7 %, 28 %
 # at most. Triads come as carried harmonics do not, and miss a share of what moves: to a factor of 1.6, 2.8 at most.
 CARRIED, RATE, SPREAD = 0.27, 0.166, 0.46
-EARLY, MISSED = 0.61, 0.097
+EARLY, MISSED = 0.61, 0.097  # of triads: over the energy, and a share of what moves
 
 
 @dataclass(frozen=True)

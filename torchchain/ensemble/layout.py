@@ -19,7 +19,7 @@ GROUPS = 16  # at least so many, for the threads to share
 CHUNK_WORK = 2**26  # particles times rows times times of a chunk of the stencil: about a second
 SMALL_WORK = 2**22  # and no less than this, where there are chains enough for every worker
 PARTS = 5  # chunks of a worker, for the progress bar, and that what goes on beside them may begin early
-BLOCKS = 20
+BLOCKS = 20  # independent means that statistics keep
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ ARTIFACT = "master equation"
 THEORY = "theory"
 STAND_INS = (ARTIFACT, THEORY)
 """What can take the place of the chains."""
-ORDERED_TOLERANCE = 1e-9
+ORDERED_TOLERANCE = 1e-9  # relative to the scale of the observables, where chains are all the same
 FRACTION_OF_NOISE = 1 / 3  # adds 5 % to the statistical error
 CONTACT_FRACTION = 0.9  # of the tolerance that linear contacts may take up; the method has the rest
 SMALL_WORK = 0.008  # seconds of work that are not worth loading compiled kernels for, which takes half a second

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.chain.chain import BOUNDARIES, CONTACTS, Chain
-from torchchain.chain.disorder import Disorder
+from torchchain.chain.disorder import LARGEST_CHAIN, Disorder
 from torchchain.chain.excitation import Impulse, StandingWave
 from torchchain.chain.scaling import Scaling
 from torchchain.chain.states import State
@@ -41,8 +41,7 @@ from torchchain.species.mixtures import MixedChain, Mixture, Species
 from torchchain.threads import kept_property
 
 System = TypeVar("System", Lattice, MixedChain)
-LARGEST_CHAIN = 10**8
-LATEST_TIME = 1e12
+LATEST_TIME = 1e12  # travel times of sound over one particle
 
 
 @dataclass(frozen=True, eq=False, repr=False)

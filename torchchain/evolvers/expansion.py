@@ -10,9 +10,9 @@ LEAP = 256.0
 # The outputs that follow a state until z exceeds SHARED_PHASE, at most LONGEST, share the kernels' recursion: the work per
 # output, degree(z) stencils for all of them plus two sums each, is flat around this minimum.
 SHARED_PHASE = 24.0
-LONGEST = 8
-SEGMENTS = 1024
-ROUNDING = 2.0**-53
+LONGEST = 8  # outputs
+SEGMENTS = 1024  # outputs at a time
+ROUNDING = 2.0**-53  # relative, of float64
 
 
 def terms(z: float, accuracy: float) -> float:

@@ -39,7 +39,7 @@ from torchchain.evolvers.symplectic import (
 )
 from torchchain.odes import INTEGRATORS, IntegrationError, Integrator, member_norm, step_grid
 
-ALLOWED_CHANGE = 0.1
+ALLOWED_CHANGE = 0.1  # of the energy, relative, before it is an error
 
 
 class _Motion:

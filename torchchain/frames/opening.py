@@ -17,7 +17,7 @@ from torchchain.frames.record import AXES
 from torchchain.frames.registry import Entry, Format
 from torchchain.frames.text import Text, readable
 
-HEAD = 1 << 14
+HEAD = 1 << 14  # bytes by which a format is known
 OPTIONS = ("time_step", "masses", "density", "contact_columns", "periodic")
 Source = str | os.PathLike[str]
 

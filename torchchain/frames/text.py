@@ -16,8 +16,8 @@ import numpy as np
 
 from torchchain import checks
 
-CHUNK = 1 << 22
-LONGEST_LINE = 1 << 16
+CHUNK = 1 << 22  # bytes read at a time
+LONGEST_LINE = 1 << 16  # bytes
 T = TypeVar("T")
 GZIP_RATIO = 1032  # deflate cannot make more bytes than this of one
 

@@ -32,7 +32,7 @@ from torchchain.master.uncertainty import draw_again, horizon
 from torchchain.progress import bar
 from torchchain.threads import beside, core_free, single_blas_thread
 
-LINEAR_WINDOW = (0.5, 2.0)
+LINEAR_WINDOW = (0.5, 2.0)  # first and last time, in travel times of sound over one particle
 REPLICATES = 20
 """Of the bootstrap, where fits are quick."""
 

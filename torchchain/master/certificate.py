@@ -20,8 +20,8 @@ from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
 from torchchain.master.proof import ROUNDING, Certificate
 
-DEGREE = 16
-REMAINDER = 1e-15
+DEGREE = 16  # of the Taylor polynomials
+REMAINDER = 1e-15  # of them, as a share of the energy
 MOST_INTERVALS = 20_000
 DEEPEST, MOST_ROWS = 40, 10**5
 """Halvings of an interval, and pieces of some intervals, before the proof is given up."""

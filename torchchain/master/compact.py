@@ -37,7 +37,7 @@ CLOCK = 10.0
 LOWEST_SHARE = -1e-6
 """Least energy, of the whole, of a model with memory that stands for another where no certified one is found."""
 
-LARGEST_EXPONENT = 60.0
+LARGEST_EXPONENT = 60.0  # natural logarithm of a factor of the odds
 
 
 def checked_degrees(degrees: Any) -> tuple[int, int, int]:

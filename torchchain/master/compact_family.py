@@ -41,7 +41,7 @@ from torchchain.master.uncertainty import Uncertainty, block_draws, combined, ho
 from torchchain.master.waves import Waves
 from torchchain.threads import single_blas_thread
 
-DEGREES = (9, 6, 14)
+DEGREES = (9, 6, 14)  # in place, distance and time
 SETS = 5
 """Polynomials of sqrt(xi), at most: 1,410 fitted numbers with these degrees."""
 STIFFNESS = 1000.0

@@ -52,7 +52,7 @@ SHORTEST, FEWEST_BANDS = 64, 8
 """Particles and bands from which on selection tries the theory."""
 MOST_RINGING_BANDS = 64
 """Bands up to which selection tries the ringing, whose fit costs as their square: half a minute of processor time at 64."""
-RATE_TIMES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+RATE_TIMES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)  # of the slopes that stand for rates
 
 
 class TheoryModel(TransferModel):

@@ -48,7 +48,7 @@ CONVENTIONS = {
     "bands": "n_bands equal bands of |k| in (0, pi]; tone n lies in band ceil(n / (n_particles / 2 / n_bands))",
     "units": "mean mass 1, linear contact stiffness 1; time: travel time of sound over one particle",
 }
-LARGEST_FILE = 2**28
+LARGEST_FILE = 2**28  # bytes
 ERROR_AXES = {
     "rates_stderr": ("band", "band"), "basis_stderr": ("band", "band"),
     "stderr_times": ("time",), "stderr": ("band", "time", "band"), "misfit_share": ("part", "time", "band"),

@@ -26,10 +26,10 @@ from torchchain.threads import kept_property
 
 RIDGE = 1.0
 """Against coefficients that the data do not tell, which would run away between the strengths of a family."""
-FIT_TIMES = 48
+FIT_TIMES = 48  # times, at most, that are fitted
 BEYOND = (1.5, 2.5, 5.0, 10.0, 30.0, 100.0, 1000.0)
 """Times after the last, in units of it, at which what has not settled is to have come nearer to Pi."""
-STEPS = 60
+STEPS = 60  # of Gauss and Newton, at most
 FIRST_DAMPING = 1e-4
 """Of the method's first step: from zero coefficients, too, steps of Gauss and Newton lead down."""
 

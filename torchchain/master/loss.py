@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-MODES = 48
+MODES = 48  # frequencies of the mixture
 FASTEST = 4.0
 """Frequencies of the mixture, up to that of the lightest particles."""
 

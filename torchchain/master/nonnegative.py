@@ -20,7 +20,7 @@ ONSET = 4
 """Derivatives at t = 0, from the zeroth, that are exact: T(t) = I + O(t^4), as for a chain released from rest."""
 MARGIN = 1e-3
 """A fitted energy stays above this share of its long-time value, so that the proof needs no fine intervals."""
-ROUNDS = 60
+ROUNDS = 60  # of fit and proof, at most
 GRID = (12, 36)
 """Times in each of the proof's intervals where constraints are looked for, until the proof succeeds."""
 CUTS = (1e-6, 1e-5, 3e-7, 3e-5)

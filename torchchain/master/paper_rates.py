@@ -17,7 +17,7 @@ from torchchain.master.sample import Sample, paper_basis
 if TYPE_CHECKING:
     import xarray
 
-WINDOW = (0.5, 2.0)
+WINDOW = (0.5, 2.0)  # first and last time, in travel times of sound over one particle
 
 
 def paper_rates(

@@ -15,7 +15,7 @@ import scipy
 
 SLOWEST, FASTEST = 1e-4, 6.0
 """Decay rates and frequencies, per unit time."""
-SLOWEST_TURN = 1e-2
+SLOWEST_TURN = 1e-2  # frequency of a pair, per unit time
 FEW_STEPS, MANY_STEPS = 40, 150
 """Of the search, from every start and from the best of what they found."""
 RANDOM_STARTS = 3

@@ -27,7 +27,7 @@ from torchchain.modes.spectrum import normal_modes
 
 FORMAT = "torchchain-nonlinear-master-equation"
 FORMAT_VERSION = 1
-LARGEST_FILE = 2**28
+LARGEST_FILE = 2**28  # bytes
 _TENSORS = ("linear", "coupling", "density", "spectrum", "shapes")
 
 

@@ -11,7 +11,7 @@ from torchchain import checks
 from torchchain.mixing.bands import FrequencyBands
 from torchchain.odes import INTEGRATORS, IntegrationError, member_norm
 
-MOST_STEPS = 10**5
+MOST_STEPS = 10**5  # from one output time to the next
 
 
 class TriadModel(nn.Module):

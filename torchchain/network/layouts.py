@@ -19,7 +19,7 @@ WINDOW = 64  # particles sorted by their number of neighbors, so that processors
 DEEPEST, SWEPT = 8, 8e6  # steps of one sweep through memory, at most, and the bytes they may hold in cache
 RENUMBER = 2_000  # particles from which a network is renumbered for the cache
 NARROW = 40  # particles in a row below which loops along it do not pay
-PAD = 1
+PAD = 1  # empty particles on either side of a row
 Run = Callable[..., None]
 """Called with steps, last, begin, end, cells, sums, table, see :func:`torchchain.network.kernels.gathered`."""
 

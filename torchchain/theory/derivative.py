@@ -15,7 +15,7 @@ from torchchain.chain import Disorder
 from torchchain.theory.law import law_of
 from torchchain.theory.transfer import described, transfer_of_law
 
-_WEAKEST = 1e-6
+_WEAKEST = 1e-6  # xi below which the slope in xi is 0
 
 
 def transfer_at(

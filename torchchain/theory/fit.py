@@ -16,8 +16,8 @@ from torchchain.chain import Disorder
 from torchchain.energy.bands import band_of, center_tones
 from torchchain.theory.transfer import theory_transfer
 
-WEAKEST, STRONGEST = 0.005, 0.8
-_MOST_DAMPING = 1.0
+WEAKEST, STRONGEST = 0.005, 0.8  # xi
+_MOST_DAMPING = 1.0  # contact damping coefficient
 _STEP = 0.01  # of the finite differences, relative
 
 

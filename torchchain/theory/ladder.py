@@ -33,8 +33,8 @@ FIRST, RATIO = 4.0, 10.0  # end of the first stretch of times, and how many time
 DECAY = 9.0  # eta times the period of the time grid: exp(-2 DECAY) = 1.5e-8 of a period's energy comes back
 _FIRST_CUT = 60.0  # frequencies kept for the first stretch: what starts as t^4 falls off as frequency^-5
 _SMOOTH = 9.0  # width of the frequency cut times the first time of a stretch: exp(-(_SMOOTH/2)^2) = 2e-9
-_LATE = 400.0  # stretches that start here or later are averaged over time, with the standard deviation
-_AVERAGE = 10.0
+_LATE = 400.0  # stretches that start here or later are averaged over time ...
+_AVERAGE = 10.0  # ... with this standard deviation
 _BLOCK = 2**22  # complex numbers of the spectrum kept at a time
 _TAIL, _LATE_TAIL = 3e-7, 1e-3  # share of the modes beyond the last frequency, and of a late stretch
 

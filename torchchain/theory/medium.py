@@ -21,8 +21,8 @@ from torchchain import checks
 from torchchain.chain import Disorder
 from torchchain.theory.law import Law, law_of
 
-_STEPS, _DAMPED_STEPS = 150, 60
-_NEAR = 0.5
+_STEPS, _DAMPED_STEPS = 150, 60  # of the iteration at most, and at its start that are Newton's only where it is near
+_NEAR = 0.5  # a step of Newton's method is taken up to this share of the value
 _ABOVE_THE_AXIS = 1e-7  # a real frequency is taken as its limit from above
 
 
