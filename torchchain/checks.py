@@ -7,7 +7,7 @@ import math
 import numbers
 import operator
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
@@ -68,9 +68,11 @@ def shown(value: Any, width: int = 80) -> str:
 
 
 def fail(field: str, rule: str, value: Any) -> FieldError:
-    """The error for a ``field`` whose ``value`` breaks the ``rule``, to be raised by the caller."""
-    message = f"{field} must {rule}, got {value if isinstance(value, str) else shown(value)}"
-    return FieldError(" ".join(message.split()))  # one line, whatever is in a path
+    """The error for a ``field`` whose ``value``, of a tensor its shape, breaks the ``rule``, to be raised by the caller."""
+    if isinstance(value, Tensor):
+        value = f"shape {tuple(value.shape)}"
+    words = value if isinstance(value, str) else shown(value)
+    return FieldError(" ".join(f"{field} must {rule}, got {words}".split()))  # one line, whatever is in a path
 
 
 def integer(field: str, value: Any, minimum: int | None = None, maximum: int | None = None) -> int:
@@ -103,8 +105,8 @@ def number(
         raise fail(field, "be finite", value) from None
     if not math.isfinite(value):
         raise fail(field, "be finite", value)
-    bounds = (operator.gt, "greater than", above), (operator.ge, "at least", at_least), (operator.lt, "less than", below)
-    for holds, words, bound in (*bounds, (operator.le, "at most", at_most)):
+    bounds = {"greater than": above, "at least": at_least, "less than": below, "at most": at_most}
+    for (words, bound), holds in zip(bounds.items(), (operator.gt, operator.ge, operator.lt, operator.le), strict=True):
         if bound is not None and not holds(value, bound):
             raise fail(field, f"be {words} {bound:g}", value)
     return value
@@ -143,6 +145,13 @@ def device(field: str, value: Any) -> torch.device:
     if found.type not in ("cpu", "cuda"):
         raise fail(field, "be cpu, cuda or cuda:<number>", repr(value))
     return torch.device("cpu") if found.type == "cpu" else found
+
+
+def table(field: str, value: Any) -> dict[str, Any]:
+    """The value as a dictionary of its own, if it is a table."""
+    if not isinstance(value, Mapping):
+        raise FieldTypeError(f"{field} must be a table, got {shown(value)}")
+    return dict(value)
 
 
 def known_keys(field: str, given: Iterable[str], allowed: Iterable[str], within: Iterable[str] = ()) -> None:
@@ -259,7 +268,7 @@ def times(field: str, value: Any) -> Tensor:
     """Output times: one-dimensional, finite, not negative, strictly increasing, at least one."""
     value = real_tensor(field, value)
     if value.ndim != 1:
-        raise fail(field, "be one-dimensional", f"shape {tuple(value.shape)}")
+        raise fail(field, "be one-dimensional", value)
     if len(value) == 0:
         raise fail(field, "hold at least one time", "none")
     first_bad(field, "not be negative", value, value < 0)

@@ -72,7 +72,7 @@ def linearity(chain: Chain, states: State | Trajectory) -> Linearity:
     n = chain.n_particles
     displacement = checks.real_tensor("states", states.displacement)
     if displacement.ndim == 0 or displacement.shape[-1] != n:
-        raise checks.fail("states", f"have {n} particles like the chain", f"shape {tuple(displacement.shape)}")
+        raise checks.fail("states", f"have {n} particles like the chain", displacement)
     elongation = chain.elongation(displacement)
     return Linearity(elongation.abs().amax(-1), elongation.amax(-1), force_deviation(elongation).amax(-1))
 

@@ -52,7 +52,7 @@ class Chain(checks.Fields):
     def __post_init__(self) -> None:
         masses = checks.real_tensor("masses", self.masses)
         if masses.ndim == 0 or masses.shape[-1] < 2:
-            raise checks.fail("masses", "hold at least 2 particles on the last axis", f"shape {tuple(masses.shape)}")
+            raise checks.fail("masses", "hold at least 2 particles on the last axis", masses)
         checks.first_bad("masses", "be positive", masses, masses <= 0, "particle")
         checks.choice("boundary", self.boundary, BOUNDARIES)
         checks.choice("contact", self.contact, CONTACTS)
@@ -69,9 +69,7 @@ class Chain(checks.Fields):
         if value.ndim == 0:
             return value.expand(self.n_contacts)
         if tuple(value.shape) not in (shape, shape[-1:]):
-            raise checks.fail(
-                field, f"be a number or have shape {shape[-1:]} or {shape}", f"shape {tuple(value.shape)}"
-            )
+            raise checks.fail(field, f"be a number or have shape {shape[-1:]} or {shape}", value)
         return value
 
     @property
@@ -123,11 +121,8 @@ class Chain(checks.Fields):
         """``values`` (*batch, x) shaped to multiply a ``field`` (*batch, *any, x) of states of these chains."""
         batch = len(self.batch_shape)
         if field.shape[:batch] != self.batch_shape or field.ndim <= batch:
-            raise checks.fail(
-                "state",
-                f"have leading axes {tuple(self.batch_shape)} like the chain's masses",
-                f"shape {tuple(field.shape)}",
-            )
+            rule = f"have leading axes {tuple(self.batch_shape)} like the chain's masses"
+            raise checks.fail("state", rule, field)
         if values.ndim == 1:
             return values
         return values.reshape(*self.batch_shape, *[1] * (field.ndim - batch - 1), values.shape[-1])

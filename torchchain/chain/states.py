@@ -32,11 +32,8 @@ class State:
         for field in ("displacement", "velocity"):
             object.__setattr__(self, field, checks.real_tensor(field, getattr(self, field)))
         if self.displacement.shape != self.velocity.shape:
-            raise checks.fail(
-                "velocity",
-                f"have the displacement's shape {tuple(self.displacement.shape)}",
-                f"shape {tuple(self.velocity.shape)}",
-            )
+            rule = f"have the displacement's shape {tuple(self.displacement.shape)}"
+            raise checks.fail("velocity", rule, self.velocity)
         if self.displacement.ndim == 0:
             raise checks.fail("displacement", "have particles on its last axis", "shape ()")
 
@@ -72,7 +69,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         checks.instance("trajectory.times", self.times, Tensor)
         if self.times.ndim != 1:
-            raise checks.fail("trajectory.times", "be one-dimensional", f"shape {tuple(self.times.shape)}")
+            raise checks.fail("trajectory.times", "be one-dimensional", self.times)
         for field in ("displacement", "velocity"):
             value = getattr(self, field)
             checks.instance(f"trajectory.{field}", value, Tensor)
@@ -88,7 +85,7 @@ class Trajectory:
             value = getattr(self, field)
             if value is not None and value.shape != expected:
                 rule = f"have shape {tuple(expected)} beside the displacement"
-                raise checks.fail(f"trajectory.{field}", rule, f"shape {tuple(value.shape)}")
+                raise checks.fail(f"trajectory.{field}", rule, value)
 
     @property
     def final(self) -> State:

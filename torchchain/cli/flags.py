@@ -179,8 +179,8 @@ class Calibrate(RunFlags):
 
     def calibration(self) -> dict[str, Any]:
         """The flags of the fit that were given."""
-        names = {"fit": "method"} | {name: name for name in ("model", "window", "constraint", "penalty", "bootstrap", "starts")}
-        return {names[name]: value for name, value in given(self).items() if name in names}
+        fit = ("fit", "model", "window", "constraint", "penalty", "bootstrap", "starts")
+        return {"method" if name == "fit" else name: value for name, value in given(self).items() if name in fit}
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,8 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
             request["strength"] = float(given["strength"])
         if loaded:
             request["plugins"] = loaded
-        text, count = tomli_w.dumps({**request, "times": times.tolist()}), f"{len(labels)} start{'s' * (len(labels) > 1)}"
+        text = tomli_w.dumps({**request, "times": times.tolist()})
+        count = f"{len(labels)} start{'s' * (len(labels) > 1)}"
         drawn = outputs.figures(_figure(starts, labels, times, energy), flags.format)
         outputs.leave(
             out, {"results.nc": outputs.dataset(data), **drawn}, arguments, text, device, began, stages.seconds,
@@ -139,13 +140,12 @@ def _starts(given: Mapping[str, Any], master: MasterEquation) -> tuple[Starts, l
 
 def _in_space(field: str, table: Any, master: MasterEquation) -> tuple[StartEnergy, list[str], dict[str, Any]]:
     """A start from an excitation, or from displacement and velocity of every particle, of energy 1."""
-    if not isinstance(table, Mapping):
-        raise checks.FieldTypeError(f"{field} must be a table, got {checks.shown(table)}")
+    table = checks.table(field, table)
     if master.starts is None:
-        raise checks.fail(field, "be left out for a model calibrated without other starts (use initial)", dict(table))
-    count, request = master.starts.n_particles, {field: dict(table)}
+        raise checks.fail(field, "be left out for a model calibrated without other starts (use initial)", table)
+    count, request = master.starts.n_particles, {field: table}
     if field == "excitation":
-        scene = Scene.from_dict({field: dict(table), "n_particles": count, "n_bands": master.n_bands})
+        scene = Scene.from_dict({field: table, "n_particles": count, "n_bands": master.n_bands})
         wave = scene.excitation
         wave = replace(wave, tones=scene.tones) if isinstance(wave, StandingWave) else wave
         start, labels = excited(wave, count), [f"tone {tone}" for tone in scene.tones] or ["impulse"]
@@ -154,9 +154,7 @@ def _in_space(field: str, table: Any, master: MasterEquation) -> tuple[StartEner
         told = {name: checks.real_tensor(f"{field}.{name}", values).double() for name, values in table.items()}
         for name, values in told.items():
             if tuple(values.shape) != (count,):
-                raise checks.fail(
-                    f"{field}.{name}", f"hold the {count} particles of the model", f"shape {tuple(values.shape)}"
-                )
+                raise checks.fail(f"{field}.{name}", f"hold the {count} particles of the model", values)
         if not told:
             raise checks.fail(field, "hold displacement, velocity or both", "neither")
         none = torch.zeros(count, dtype=torch.float64)

@@ -210,7 +210,8 @@ def _done(record: Mapping[str, Any]) -> list[str]:
     if "resolved" in record:
         options = [f"{name} = {value}" for name, value in record["resolved"]["options"].items()]
         rows.append(("method", ", ".join([record["resolved"]["method"], *options])))
-    rows += [(name, record[name]) for name in ("seed", "device", "threads", "processes") if record.get(name) is not None]
+    told = ((name, record.get(name)) for name in ("seed", "device", "threads", "processes"))
+    rows += [(name, value) for name, value in told if value is not None]
     forecast = record.get("forecast") or {}
     rows += [(words, forecast[name]) for name, words in FORECAST.items() if name in forecast]
     for what in ("transfer", "model"):

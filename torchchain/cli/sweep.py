@@ -227,7 +227,8 @@ def _table(fields: Mapping[str, Any], points: Sequence[Point], rows: Sequence[Ma
     text = io.StringIO()
     writer = csv.DictWriter(text, dict.fromkeys([*fields, *itertools.chain(*rows)]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows({**dict(zip(fields, point.values, strict=True)), **row} for point, row in zip(points, rows, strict=True))
+    for point, row in zip(points, rows, strict=True):
+        writer.writerow({**dict(zip(fields, point.values, strict=True)), **row})
     return text.getvalue()
 
 

@@ -45,14 +45,14 @@ class StartEnergy:
             value = checks.real_tensor(name, getattr(self, name))
             shape = tuple(value.shape) if shape is None else shape
             if not shape or tuple(value.shape) != shape:
-                raise checks.fail(name, "have the axes (*batch, tone) of potential", f"shape {tuple(value.shape)}")
+                raise checks.fail(name, "have the axes (*batch, tone) of potential", value)
             if name != "virial":
                 checks.first_bad(name, "not be negative", value, value < 0, "tone")
             object.__setattr__(self, name, value)
         assert shape is not None, "just set"
         rigid = checks.real_tensor("rigid", self.rigid)
         if tuple(rigid.shape) != shape[:-1]:
-            raise checks.fail("rigid", f"have shape {shape[:-1]}", f"shape {tuple(rigid.shape)}")
+            raise checks.fail("rigid", f"have shape {shape[:-1]}", rigid)
         object.__setattr__(self, "rigid", rigid)
 
     @property

@@ -99,7 +99,7 @@ def wavenumber_energy_matrix(matrices: EnergyMatrices) -> Tensor:
     total = checks.real_tensor("matrices.total", matrices.total)
     n = total.shape[-1] if total.ndim > 1 else 0
     if n == 0 or total.shape[-2] != n:
-        raise checks.fail("matrices.total", "be square on its last axes", f"shape {tuple(total.shape)}")
+        raise checks.fail("matrices.total", "be square on its last axes", total)
     index = torch.arange(n, device=total.device)
     angle = (-2 * math.pi / n) * ((index[:, None] * index) % n).to(total.dtype)
     dft = torch.polar(torch.full_like(angle, n**-0.5), angle)

@@ -168,7 +168,7 @@ class Chunk:
         shape = (*self.state.displacement.shape[:-inner], *(lengths[axis] for axis in entry.axes))
         checks.instance(f"observable {entry.name}", values, Tensor)
         if tuple(values.shape) != shape:
-            raise checks.fail(f"observable {entry.name}", f"give shape {shape}", f"shape {tuple(values.shape)}")
+            raise checks.fail(f"observable {entry.name}", f"give shape {shape}", values)
         if values.is_complex():
             raise checks.fail(f"observable {entry.name}", "give real numbers", values.dtype)
         return values

@@ -43,9 +43,8 @@ class Agreement:
     def __str__(self) -> str:
         words = f"{self.variable}: {self.n_values} values, largest difference {self.largest_difference:.3g}"
         if not math.isnan(self.rms_z):
-            words += (
-                f"; z-score rms {self.rms_z:.3g}, largest {self.largest_z:.3g}, {100 * self.within_one:.0f} % within 1"
-            )
+            within = f"{100 * self.within_one:.0f} % within 1"
+            words += f"; z-score rms {self.rms_z:.3g}, largest {self.largest_z:.3g}, {within}"
         if not math.isnan(self.total_variation):
             words += (
                 f"; total variation {self.total_variation:.3g}, {self.expected_distance:.3g} expected of two samples"
@@ -120,13 +119,7 @@ def _agreement(a: xarray.Dataset, b: xarray.Dataset, variable: str) -> Agreement
             distance = float(abs(later).sum(axis).mean() / 2)
             # A normal difference of standard deviation s has the mean absolute value s sqrt(2 / pi).
             expected = float(error.sel(later.indexes).sum(axis).mean() / math.sqrt(2 * math.pi))
-    return Agreement(
-        variable,
-        difference.size,
-        float(abs(difference).max()),
-        float(np.sqrt(np.mean(z**2))) if z.size else math.nan,
-        float(np.abs(z).max()) if z.size else math.nan,
-        float(np.mean(np.abs(z) <= 1)) if z.size else math.nan,
-        distance,
-        expected,
-    )
+    rms = top = within = math.nan
+    if z.size:
+        rms, top, within = float(np.sqrt(np.mean(z**2))), float(np.abs(z).max()), float(np.mean(np.abs(z) <= 1))
+    return Agreement(variable, difference.size, float(abs(difference).max()), rms, top, within, distance, expected)

@@ -43,9 +43,8 @@ def footprint(scene: Scene, method: str, fused: bool) -> Footprint:
     observables = chosen_observables(scene.observables)
     numbers = sum(math.prod(scene.lengths[axis] for axis in entry.axes) for entry in observables)
     averages = any(not entry.in_time for entry in observables)
-    matrices = max(
-        0 if method == "auto" else scene.methods[method].matrices, scene.methods["modes"].matrices * averages
-    )
+    own = 0 if method == "auto" else scene.methods[method].matrices
+    matrices = max(own, scene.methods["modes"].matrices * averages)
     arrays = FUSED if fused or method == "auto" else STATES
     if scene.lattices is not None:
         arrays = STATES + math.ceil(4 * scene.lattices.n_bonds / scene.n_particles)
@@ -73,10 +72,6 @@ def check(scene: Scene, one: Footprint, window: int, nodes: int, device: torch.d
             continue
         words = f"at most the {gigabytes(limit)} of memory of {'this machine' if place == cpu else place}"
         if results > work:
-            raise checks.fail(
-                "observables",
-                f"take {words}",
-                f"{', '.join(scene.observables)} at {len(scene.times)} times of {scene.n_particles} particles: about "
-                f"{gigabytes(results)}",
-            )
+            what = f"{', '.join(scene.observables)} at {len(scene.times)} times of {scene.n_particles} particles"
+            raise checks.fail("observables", f"take {words}", f"{what}: about {gigabytes(results)}")
         raise checks.fail("n_particles", f"need {words}", f"{scene.n_particles}: about {gigabytes(work)}")

@@ -65,11 +65,9 @@ class LatticeFacts:
         rounding = EPS * (2000 + 40 * self.top * self.end)
         if method == "verlet":
             return self._step_error() * options["step"] ** 2 + rounding
-        return (
-            math.inf
-            if self.n > self.scene.methods[method].most_unknowns
-            else 5 * options.get("accuracy", 0.0) + rounding
-        )
+        if self.n > self.scene.methods[method].most_unknowns:
+            return math.inf
+        return 5 * options.get("accuracy", 0.0) + rounding
 
     def _step_error(self) -> float:
         """Verlet's phase errors w^3 step^2 t / 24 at the highest frequency, in the energies twice that."""
@@ -91,12 +89,8 @@ class LatticeFacts:
             seconds += float((self.gaps / options["step"]).ceil().sum()) * self.rows * (4 * self.bonds * BOND + LOOP)
         else:
             seconds += self._chebyshev(options["accuracy"])
-        for entry in observables:
-            if entry.in_time:
-                seconds += states * (
-                    n * (TRANSFORM + 6 * self.scene.n_bands * PRODUCT) if entry.bands else self.bonds * SPACE
-                )
-        return seconds
+        bands = n * (TRANSFORM + 6 * self.scene.n_bands * PRODUCT)
+        return seconds + sum(states * (bands if e.bands else self.bonds * SPACE) for e in observables if e.in_time)
 
     def _chebyshev(self, accuracy: float) -> float:
         products = sums = 0.0

@@ -142,8 +142,11 @@ def with_late_average(transfer: BandTransfer) -> BandTransfer:
     blocks, _ = late_average(transfer.times, transfer.block_mean)
     weights = torch.tensor(transfer.block_counts, dtype=blocks.dtype)[:, None, None]
     squares = (weights * (blocks - average).square()).sum(0)
-    error = (squares / weights.sum() / (len(blocks) - 1)).sqrt() if len(blocks) > 1 else torch.full_like(squares, torch.inf)
-    error = torch.zeros_like(squares) if transfer.is_ordered else error
+    error = torch.full_like(squares, torch.inf)
+    if transfer.is_ordered:
+        error = torch.zeros_like(squares)
+    elif len(blocks) > 1:
+        error = (squares / weights.sum() / (len(blocks) - 1)).sqrt()
     stderr = (error.square() + unsettled.square()).sqrt()
     return replace(transfer, long_time=average[0], long_time_stderr=stderr, block_long_time=blocks)
 

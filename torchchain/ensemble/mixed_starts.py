@@ -55,11 +55,8 @@ def fit_transfer(starts: Tensor, energies: Tensor, realization: Tensor) -> Fitte
     starts = checks.real_tensor("starts", starts).double()
     energies = checks.real_tensor("energies", energies).double()
     if starts.ndim != 2 or energies.ndim != 3 or len(starts) != len(energies) or starts.shape[1] != energies.shape[2]:
-        raise checks.fail(
-            "energies",
-            f"have shape (run, time, band) that fits starts {tuple(starts.shape)}",
-            f"shape {tuple(energies.shape)}",
-        )
+        rule = f"have shape (run, time, band) that fits starts {tuple(starts.shape)}"
+        raise checks.fail("energies", rule, energies)
     condition = condition_of(starts)
     chains = torch.unique(realization)
     blocks = min(MOST_BLOCKS, len(chains))

@@ -19,11 +19,6 @@ class Printed:
         return "\n".join([type(self).__name__, *lines])
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th>{escape(name)}</th><td>{_html(words)}</td></tr>" for name, words in self._rows().items()
-        )
+        plain = ((escape(name), "<br>".join(escape(words).split("\n"))) for name, words in self._rows().items())
+        rows = "".join(f"<tr><th>{name}</th><td>{words}</td></tr>" for name, words in plain)
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
-
-
-def _html(words: str) -> str:
-    return escape(words).replace("\n", "<br>")

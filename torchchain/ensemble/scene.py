@@ -40,7 +40,7 @@ from torchchain.species.energy import species_waves
 from torchchain.species.mixtures import MixedChain, Mixture, Species
 from torchchain.threads import kept_property
 
-System = TypeVar("System", Lattice, MixedChain)
+System = TypeVar("System", bound=Chain | Lattice)
 LATEST_TIME = 1e12  # travel times of sound over one particle
 
 
@@ -305,26 +305,16 @@ class Scene(Printed, checks.Fields):
         """
         if self.lattice is not None:
             raise checks.fail("lattice", "be None for chains (scene.system gives either)", repr(self.lattice))
-        numbers = list(realizations)
+        numbers, n = list(realizations), self.n_particles
+        factor: float | Tensor = 1.0
+        if self.stiffness_disorder is not None:
+            n_contacts = n + (self.boundary == "fixed")
+            factor = self.stiffness_disorder.stiffnesses(n_contacts, numbers, self.seed, self.opposite_pairs)
         if self.mixture is not None:
-            return self._mixed(self.mixture, numbers, device, dtype)
-        masses = self.disorder.masses(self.n_particles, numbers, self.seed, self.opposite_pairs)
-        stiffness: float | Tensor = 1.0
-        if self.stiffness_disorder is not None:
-            n_contacts = self.n_particles + (self.boundary == "fixed")
-            stiffness = self.stiffness_disorder.stiffnesses(n_contacts, numbers, self.seed, self.opposite_pairs).to(
-                device, dtype
-            )
-        return Chain(masses.to(device, dtype), self.boundary, stiffness, self.contact, self.damping)
-
-    def _mixed(
-        self, mixture: Mixture, numbers: list[int], device: torch.device | str, dtype: torch.dtype
-    ) -> MixedChain:
-        made = mixture.chain(self.n_particles, numbers, self.seed, self.boundary, self.contact, self.disorder)
-        if self.stiffness_disorder is not None:
-            factor = self.stiffness_disorder.stiffnesses(made.n_contacts, numbers, self.seed)
-            made = dataclasses.replace(made, stiffness=made.contact_stiffness * factor)
-        return _moved(made, device, dtype)
+            mixed = self.mixture.chain(n, numbers, self.seed, self.boundary, self.contact, self.disorder)
+            return _moved(dataclasses.replace(mixed, stiffness=mixed.contact_stiffness * factor), device, dtype)
+        masses = self.disorder.masses(n, numbers, self.seed, self.opposite_pairs)
+        return _moved(Chain(masses, self.boundary, factor, self.contact, self.damping), device, dtype)
 
     def system(
         self, realizations: Iterable[int], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
@@ -332,8 +322,7 @@ class Scene(Printed, checks.Fields):
         """The chains or lattices of the given realizations (counted from 0), masses (realization, particle)."""
         if self.lattices is None:
             return self.chain(realizations, device, dtype)
-        made = self.lattices.draw(list(realizations), self.seed)
-        return made if dtype == torch.float64 and torch.device(device).type == "cpu" else _moved(made, device, dtype)
+        return _moved(self.lattices.draw(list(realizations), self.seed), device, dtype)
 
     def state(self, chain: Chain | Lattice) -> State:
         """The start of every system, (realization, particle) or (realization, tone, particle), and component of lattices."""
@@ -374,7 +363,9 @@ class Scene(Printed, checks.Fields):
 
 
 def _moved(network: System, device: torch.device | str, dtype: torch.dtype) -> System:
-    """The lattices or chains on another device, in another precision."""
+    """The lattices or chains, made on the CPU in float64, on the device in the precision."""
+    if dtype == torch.float64 and torch.device(device).type == "cpu":
+        return network
     values: dict[str, Any] = {
         entry.name: value.to(device, dtype if value.is_floating_point() else None)
         for entry in dataclasses.fields(network)

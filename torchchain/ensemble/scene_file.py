@@ -72,7 +72,7 @@ def fields_of(plain: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
         if name in fields:
             fields[name] = _from_table(name, fields[name], Disorder)
     if "excitation" in fields:
-        table = _table("excitation", fields["excitation"])
+        table = checks.table("excitation", fields["excitation"])
         kind = checks.choice("excitation.kind", table.pop("kind", "standing_wave"), EXCITATIONS)
         owner = {entry.name: other for other, record in EXCITATIONS.items() for entry in dataclasses.fields(record)}
         for name in table:
@@ -112,7 +112,7 @@ def regular_times(start: float, stop: float, step: float) -> Tensor:
 
 
 def _times_from_table(value: Any) -> Tensor:
-    table = _table("times", value)
+    table = checks.table("times", value)
     checks.known_keys("times", table, ("start", "stop", "step"))
     for key in ("stop", "step"):
         if key not in table:
@@ -122,7 +122,7 @@ def _times_from_table(value: Any) -> Tensor:
 
 def _made_dimensionless(fields: dict[str, Any]) -> dict[str, Any]:
     """The fields of a scene file whose table ``si`` states some of them in SI units."""
-    table = _table("si", fields["si"])
+    table = checks.table("si", fields["si"])
     given = {name: table.pop(name) for name in ("times", "velocity", "amplitude", "damping") if name in table}
     missing = [entry.name for entry in dataclasses.fields(Scaling) if entry.name not in table]
     if missing:
@@ -139,7 +139,7 @@ def _made_dimensionless(fields: dict[str, Any]) -> dict[str, Any]:
         fields["damping"] = scaling.from_si("damping", checks.number("si.damping", given["damping"], at_least=0))
     for name, quantity in (("velocity", "velocity"), ("amplitude", "length")):
         if name in given:
-            excitation = _table("excitation", fields.get("excitation", {}))
+            excitation = checks.table("excitation", fields.get("excitation", {}))
             _only_once(name, excitation)
             excitation[name] = scaling.from_si(quantity, checks.number(f"si.{name}", given[name]))
             fields["excitation"] = excitation
@@ -167,14 +167,8 @@ def plain_of(record: Any) -> dict[str, Any]:
     return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items() if v is not None}
 
 
-def _table(field_name: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, Mapping):
-        raise checks.FieldTypeError(f"{field_name} must be a table, got {checks.shown(value)}")
-    return dict(value)
-
-
 def _from_table(field_name: str, value: Any, kind: type) -> Any:
-    table = _table(field_name, value)
+    table = checks.table(field_name, value)
     checks.known_keys(field_name, table, [entry.name for entry in dataclasses.fields(kind)])
     try:
         return kind(**table)

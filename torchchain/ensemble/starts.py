@@ -79,11 +79,9 @@ class StartTransfer:
             value = checks.real_tensor(f"starts.{name}", getattr(self, name))
             if value.ndim != 3 or tuple(value.shape[:2]) != (len(tones), len(self.times)):
                 rule = f"have the axes [tone, time, receiver] of {len(tones)} tones and {len(self.times)} times"
-                raise checks.fail(f"starts.{name}", rule, f"shape {tuple(value.shape)}")
+                raise checks.fail(f"starts.{name}", rule, value)
             if value.shape != self.released.shape:
-                raise checks.fail(
-                    f"starts.{name}", f"have shape {tuple(self.released.shape)}", f"shape {tuple(value.shape)}"
-                )
+                raise checks.fail(f"starts.{name}", f"have shape {tuple(self.released.shape)}", value)
             if name.endswith("stderr"):
                 checks.first_bad(f"starts.{name}", "not be negative", value, value < 0, "band")
 

@@ -89,7 +89,7 @@ class BandTransfer(Printed):
         object.__setattr__(self, "times", checks.times("times", self.times))
         checks.instance("mean", self.mean, Tensor)
         if self.mean.ndim != 3:
-            raise checks.fail("mean", "have the axes [source, time, receiver]", f"shape {tuple(self.mean.shape)}")
+            raise checks.fail("mean", "have the axes [source, time, receiver]", self.mean)
         counts, n = self.block_counts, self.scene.n_bands if self.scene is not None else len(self.mean)
         if not isinstance(counts, (list, tuple)) or not counts:
             raise checks.FieldTypeError(f"block_counts must be a list of integers, got {checks.shown(counts)}")
@@ -107,7 +107,7 @@ class BandTransfer(Printed):
             if value.layout != torch.strided or value.is_meta or not value.is_floating_point():
                 raise checks.FieldTypeError(f"{name} must be a dense floating-point tensor, got {value.dtype}")
             if tuple(value.shape) != shape:
-                raise checks.fail(name, f"have shape {shape}", f"shape {tuple(value.shape)}")
+                raise checks.fail(name, f"have shape {shape}", value)
             if "stderr" in name:  # infinite for one realization
                 checks.first_bad(name, "not be negative", value, ~(value >= 0), "band")
             else:

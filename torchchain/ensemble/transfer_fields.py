@@ -59,7 +59,7 @@ def from_energies(
     if energies.ndim != 4 or not square or energies.shape[2] != len(times):
         as_many = "" if starts is not None else " and as many sources as receivers"
         rule = f"have the axes (realization, source, time, receiver) with {len(times)} times{as_many}"
-        raise checks.fail("energies", rule, f"shape {tuple(energies.shape)}")
+        raise checks.fail("energies", rule, energies)
     if not len(energies):
         raise checks.fail("energies", "hold at least one realization", "none")
     times, energies = times.detach().cpu().double(), energies.detach().cpu().double()
@@ -70,7 +70,7 @@ def from_energies(
         starts = checks.real_tensor("starts", starts).detach().cpu().double()
         expected = (*energies.shape[:2], energies.shape[3])
         if tuple(starts.shape) != expected:
-            raise checks.fail("starts", f"have shape {expected}", f"shape {tuple(starts.shape)}")
+            raise checks.fail("starts", f"have shape {expected}", starts)
         checks.first_bad("starts", "not be negative by more than a tenth", starts, starts < -0.1, "realization")
         late = None if long_time is None else checks.real_tensor("long_time", long_time).cpu().double()
         per_run = late is not None and late.ndim == 3
@@ -138,7 +138,7 @@ def of_runs(
     elif per_run:
         ends += [late[:, None]]
     elif tuple(late.shape) != (n, n):
-        raise checks.fail("long_time", f"have shape {(n, n)} (source, receiver)", f"shape {tuple(late.shape)}")
+        raise checks.fail("long_time", f"have shape {(n, n)} (source, receiver)", late)
     found = fit_transfer(starts, torch.cat([energies, *ends], 1), realization)
     if late is not None and not per_run:
         average, error, blocks = late, torch.zeros_like(late), late.expand(len(found.block_counts), n, n)
@@ -160,7 +160,7 @@ def _shaped(late: Tensor, *shapes: tuple[int, ...]) -> Tensor:
     """A long-time average that is given, of one of the shapes."""
     if tuple(late.shape) not in shapes:
         rule = f"have shape {' or '.join(str(shape) for shape in reversed(shapes))}"
-        raise checks.fail("long_time", rule, f"shape {tuple(late.shape)}")
+        raise checks.fail("long_time", rule, late)
     return late
 
 

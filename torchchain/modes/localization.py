@@ -54,11 +54,8 @@ def lyapunov_exponent(
     """
     checks.instance("disorder", disorder, Disorder)
     checks.instance("stiffness_disorder", stiffness_disorder, Disorder, type(None))
-    w = checks.real_tensor("frequencies", frequencies).to(torch.float64)
-    checks.first_bad("frequencies", "not be negative", w, w < 0)
+    w = checked_frequencies(frequencies).to(torch.float64)
     checks.first_bad("frequencies", "be at most 1e100", w, w > 1e100)
-    if w.ndim != 1:
-        raise checks.fail("frequencies", "be one-dimensional", f"shape {tuple(w.shape)}")
     realizations = checks.integer("realizations", realizations, 2)
     masses = disorder.masses(n_particles, realizations, seed)
     softness = torch.ones_like(masses)
@@ -114,11 +111,17 @@ def count_modes_below(chain: Chain, frequencies: Any) -> Tensor:
         [17, 34, 100]
     """
     checks.instance("chain", chain, Chain)
-    w = checks.real_tensor("frequencies", frequencies).to(chain.masses)
+    w = checked_frequencies(frequencies).to(chain.masses)
+    return negative_pivots(chain, w.square().expand(*chain.batch_shape, len(w)))
+
+
+def checked_frequencies(frequencies: Any) -> Tensor:
+    """Frequencies w >= 0, (frequency,)."""
+    w = checks.real_tensor("frequencies", frequencies)
     checks.first_bad("frequencies", "not be negative", w, w < 0)
     if w.ndim != 1:
-        raise checks.fail("frequencies", "be one-dimensional", f"shape {tuple(w.shape)}")
-    return negative_pivots(chain, w.square().expand(*chain.batch_shape, len(w)))
+        raise checks.fail("frequencies", "be one-dimensional", w)
+    return w
 
 
 def negative_pivots(chain: Chain, squared: Tensor) -> Tensor:
