@@ -75,14 +75,10 @@ def build(place: Place, raw: Raw, contacts: Raw | None, first: Frame | None, opt
     frame = replace(
         frame, ids=first.ids, masses=first.masses, radii=first.radii if frame.radii is None else frame.radii
     )
-    if contacts is None and raw.contacts is not None and place.contact_file is None:
-        frame = replace(frame, contacts=own_contacts(frame, raw.contacts))
-    if contacts is not None:
-        assert place.contact_file is not None
-        assert place.contact_entry is not None
-        listed = where(place.contact_file.path.name, place.contact_entry.number)
-        frame = replace(frame, contacts=contacts_of(listed, contacts.columns, frame, place.file.path.name))
-    return frame
+    if contacts is not None and place.listed is not None:
+        listed = where(place.listed[0].path.name, place.listed[1].number)
+        return replace(frame, contacts=contacts_of(listed, contacts.columns, frame, place.file.path.name))
+    return frame if raw.contacts is None else replace(frame, contacts=own_contacts(frame, raw.contacts))
 
 
 def _marked(box: Box | None, options: dict[str, Any]) -> Box | None:

@@ -32,13 +32,12 @@ class File:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a frame and its contacts are."""
+    """Where a frame is, and where its contacts are if they are in a file of their own."""
 
     number: int
     file: File
     entry: Entry
-    contact_file: File | None = None
-    contact_entry: Entry | None = None
+    listed: tuple[File, Entry] | None = None
 
 
 def find(
@@ -185,7 +184,4 @@ def _with_contacts(places: list[Place], files: list[Path], options: dict[str, An
         raise checks.fail(
             f"{files[0].name}: {kind}", f"be that of a frame of {places[0].file.path.name}", checks.shown(list(by)[:3])
         )
-    return [
-        replace(place, contact_file=one[0], contact_entry=one[1]) if one else place
-        for place, one in zip(places, found, strict=True)
-    ]
+    return [replace(place, listed=one) for place, one in zip(places, found, strict=True)]

@@ -115,7 +115,8 @@ class Frames:
     def files(self) -> list[Path]:
         """Every file that is read: of frames, of contacts, and of masses."""
         given = self._options.get("masses")
-        found = [file.path for place in self._places for file in (place.file, place.contact_file) if file is not None]
+        found = [place.file.path for place in self._places]
+        found += [place.listed[0].path for place in self._places if place.listed]
         if isinstance(given, (str, os.PathLike)):
             found.append(Path(given))
         elif given is None and self._options.get("density") is None:
@@ -342,9 +343,9 @@ class Frames:
             yield from file.format.read(file.path, group, self._options)
 
     def _frames(self, places: Sequence[Place]) -> Iterator[Frame]:
-        contacts = self._raws([(place.contact_file, place.contact_entry) for place in places if place.contact_entry])
+        contacts = self._raws([place.listed for place in places if place.listed])
         for place, raw in zip(places, self._raws([(place.file, place.entry) for place in places]), strict=True):
-            joined = next(contacts) if place.contact_entry is not None else None
+            joined = next(contacts) if place.listed else None
             frame = build(place, raw, joined, self._origin, self._options)
             if self._keep is not None:
                 frame = kept(frame, torch.searchsorted(frame.ids, self._keep))
