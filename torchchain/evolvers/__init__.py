@@ -16,21 +16,14 @@ for _method in (
 ):  # fmt: skip
     register_method(_method)
 
-__all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "evolved", "register_method", "start"]
+__all__ = ["METHODS", "Advance", "Method", "Trajectory", "evolve", "register_method", "start"]
 
 
 def evolve(chain: Chain, state: State, times: Any, method: str = "modes", **options: Any) -> Trajectory:
-    """``tc.evolve`` of chains alone; see :func:`torchchain.network.systems.evolve`."""
-    return evolved(chain, state, times, method, options, stacklevel=4)
-
-
-def evolved(
-    chain: Chain, state: State, times: Any, method: str, options: dict[str, Any], stacklevel: int
-) -> Trajectory:
-    """:func:`evolve`, whose warning names the line so many calls up."""
+    """What :func:`torchchain.evolve` is for chains; its warnings name the line that has called that."""
     advance = start(chain, state, method, **options)
-    amplitude.warn_if_nonlinear(chain, state, amplitude.DEVIATION_WHERE_OPEN, stacklevel=stacklevel)
-    scaling.warn_if_unscaled(chain, stacklevel)
+    amplitude.warn_if_nonlinear(chain, state, amplitude.DEVIATION_WHERE_OPEN, stacklevel=4)
+    scaling.warn_if_unscaled(chain, stacklevel=4)
     return advance(checks.times("times", times).to(state.displacement.device))
 
 

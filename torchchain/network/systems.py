@@ -6,11 +6,10 @@ from typing import Any, overload
 
 from torch import Tensor
 
-from torchchain import checks
+from torchchain import checks, evolvers
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.energy import wavenumber
-from torchchain.evolvers import evolved
 from torchchain.modes import spectrum
 from torchchain.modes.spectrum import NormalModes
 from torchchain.network import bands
@@ -51,7 +50,7 @@ def evolve(chain: Chain | Network, state: State, times: Any, method: str = "mode
     """
     if isinstance(chain, Network):
         return begin(chain, state, method, **options)(checks.times("times", times).to(state.displacement.device))
-    return evolved(chain, state, times, method, options, stacklevel=4)
+    return evolvers.evolve(chain, state, times, method, **options)
 
 
 @overload
