@@ -87,15 +87,13 @@ def force_deviation(elongation: Tensor) -> Tensor:
 
 
 def elongation_bound(chain: Chain, state: State) -> Tensor:
-    """The largest elongation that the energy of a start allows any linear contact, now and later, (*batch, *any).
+    """The largest elongation, or compression of a Hertz contact, that the energy of a start allows, now and later, (*batch, *any).
 
-    sqrt(2 E / kappa): rigorous, and reached only if all energy met in the softest contact, so far too large for
+    sqrt(2 E / kappa), as a compression x takes at least kappa x^2 / 2: rigorous, and reached only if all energy met in the softest contact, so far too large for
     a wave that extends over many particles.
     """
-    kinetic = (chain.align(chain.masses, state.velocity) * state.velocity.square()).sum(-1)
-    elongation = chain.elongation(state.displacement)
-    stiffness = chain.align(chain.contact_stiffness, elongation)
-    return ((kinetic + (stiffness * elongation.square()).sum(-1)) / stiffness.amin(-1)).sqrt()
+    softest = chain.align(chain.contact_stiffness.amin(-1, keepdim=True), state.displacement)[..., 0]
+    return (2 * chain.energy(state.displacement, state.velocity) / softest).sqrt()
 
 
 def elongation_estimate(chain: Chain, state: State) -> Tensor:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
+from torchchain.chain.amplitude import elongation_bound
 from torchchain.chain.chain import Chain
 from torchchain.chain.states import State, Trajectory
 from torchchain.evolvers import energy_guard
@@ -72,13 +73,9 @@ def damping_rate(chain: Chain) -> Tensor:
 
 
 def largest_overlap(chain: Chain, state: State) -> Tensor:
-    """The largest overlap that the state's energy allows any Hertz contact, now and later, (*batch, *any).
-
-    The energy of a contact compressed by x is at least kappa x^2 / 2, and no contact can hold more than all of it.
-    """
+    """The largest overlap that the state's energy allows any Hertz contact, now and later, (*batch, *any)."""
     with torch.no_grad():
-        energy = chain.energy(state.displacement, state.velocity)
-        return 1 + (2 * energy / _of_states(chain, chain.contact_stiffness.amin(-1), state)).sqrt()
+        return 1 + elongation_bound(chain, state)
 
 
 def initial_overlap(chain: Chain, state: State) -> Tensor:
