@@ -98,11 +98,7 @@ def kept(frame: Frame, places: Tensor) -> Frame:
         moved[-1] = -1
         pairs = moved[contacts.pairs]
         # A contact with a particle that is left out is one with a wall.
-        inside = (pairs >= 0).any(-1)
-        pairs = pairs[inside].clamp(min=-1)
-        contacts = Contacts(
-            pairs, *(None if v is None else v[inside] for v in (contacts.overlap, contacts.normal_force))
-        )
+        contacts = replace(contacts, pairs=pairs.clamp(min=-1)).where((pairs >= 0).any(-1))
 
     def part(values: Tensor | None) -> Tensor | None:
         return None if values is None else values[places]

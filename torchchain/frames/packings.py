@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.frames.doubts import warn
-from torchchain.frames.record import AXES, Frame
+from torchchain.frames.record import AXES, Contacts, Frame
 from torchchain.frames.units import LAWS, at_rest, contact_stiffness, finite_masses, periods, separation
 from torchchain.network import Network, Packing, packing
 from torchchain.network.packings import contact_law
@@ -38,8 +38,9 @@ def network(
     if isinstance(stiffness, str):
         checks.choice("stiffness", stiffness, LAWS)
         contact = stiffness
-    rested = replace(reference, masses=masses, radii=radii, contacts=at_rest(frame, reference, contact))
-    if rested.contacts is None:
+    contacts = at_rest(frame, reference, contact)
+    rested = replace(reference, masses=masses, radii=radii, contacts=contacts)
+    if contacts is None:
         if isinstance(stiffness, str):
             contact_stiffness(rested, stiffness)  # an error: there is no list
         if radii is None:
@@ -53,11 +54,10 @@ def network(
             return packing(reference.positions, radii, masses, box, modulus, contact, damping, prestress)
         except checks.FieldError as error:
             raise checks.FieldError(reference.at(str(error))) from None
-    rested = _between_grains(rested)
-    force, slope = _laws(rested, stiffness, contact, prestress)
-    assert rested.contacts is not None
+    contacts = _between_grains(rested, contacts)
+    force, slope = _laws(replace(rested, contacts=contacts), contacts, stiffness, contact, prestress)
     fields: dict[str, Any] = {
-        "masses": masses, "positions": reference.positions, "bonds": rested.contacts.pairs, "stiffness": slope,
+        "masses": masses, "positions": reference.positions, "bonds": contacts.pairs, "stiffness": slope,
         "tension": -force if prestress else 0.0, "box": box, "damping": damping,
     }  # fmt: skip
     try:
@@ -68,30 +68,29 @@ def network(
         raise checks.FieldError(reference.at(str(error))) from None
 
 
-def _between_grains(frame: Frame) -> Frame:
-    """The frame with contacts between its particles only, and those that are closed."""
-    contacts = frame.contacts
-    assert contacts is not None
+def _between_grains(frame: Frame, contacts: Contacts) -> Contacts:
+    """Those between the frame's particles only, and closed."""
     walls = (contacts.pairs < 0).any(-1)
     if bool(walls.any()):
         warn(frame.at("contacts"), f"{int(walls.sum())} with walls are left out, as a network has none")
-    pairs = contacts.pairs[~walls]
-    overlap, force = (None if v is None else v[~walls] for v in (contacts.overlap, contacts.normal_force))
-    if overlap is None and frame.radii is not None and len(pairs):
-        overlap = frame.radii[pairs].sum(-1) - separation(frame, pairs)
-    if overlap is not None and bool((overlap <= 0).any()):
-        open_ones = overlap <= 0
-        warn(frame.at("contacts"), f"{int(open_ones.sum())} of {len(pairs)} are open and left out")
-        pairs, overlap, force = pairs[~open_ones], overlap[~open_ones], None if force is None else force[~open_ones]
-    if not len(pairs):
+    contacts = contacts.where(~walls)
+    if contacts.overlap is None and frame.radii is not None and len(contacts.pairs):
+        overlap = frame.radii[contacts.pairs].sum(-1) - separation(frame, contacts.pairs)
+        contacts = replace(contacts, overlap=overlap)
+    if contacts.overlap is not None and bool((contacts.overlap <= 0).any()):
+        closed = contacts.where(contacts.overlap > 0)
+        left = len(contacts.pairs) - len(closed.pairs)
+        warn(frame.at("contacts"), f"{left} of {len(contacts.pairs)} are open and left out")
+        contacts = closed
+    if not len(contacts.pairs):
         raise checks.fail(frame.at("contacts"), "be at least one between two particles", "none")
-    return replace(frame, contacts=replace(contacts, pairs=pairs, overlap=overlap, normal_force=force))
+    return contacts
 
 
-def _laws(frame: Frame, stiffness: float | str, contact: str, prestress: bool) -> tuple[Tensor, Tensor]:
-    """Force and its slope at every contact."""
-    contacts = frame.contacts
-    assert contacts is not None
+def _laws(
+    frame: Frame, contacts: Contacts, stiffness: float | str, contact: str, prestress: bool
+) -> tuple[Tensor, Tensor]:
+    """Force and its slope at every contact of the frame."""
     if isinstance(stiffness, str):
         slope = contact_stiffness(frame, stiffness)
         assert contacts.normal_force is not None

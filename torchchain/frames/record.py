@@ -78,6 +78,11 @@ class Contacts:
     overlap: Tensor | None = None
     normal_force: Tensor | None = None
 
+    def where(self, keep: Tensor) -> Contacts:
+        """Those where ``keep`` (contact,) holds."""
+        overlap, force = (None if v is None else v[keep] for v in (self.overlap, self.normal_force))
+        return Contacts(self.pairs[keep], overlap, force)
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:

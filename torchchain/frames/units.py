@@ -134,10 +134,14 @@ def fit_units(frame: Frame, law: str) -> ContactUnits:
 def scaled_frame(frame: Frame, units: Any) -> Frame:
     """The frame in other units, anything with ``unit(quantity)``."""
     length, time, mass, force = (float(units.unit(name)) for name in ("length", "time", "mass", "force"))
-    box = frame.box
+    box, contacts = frame.box, frame.contacts
     if box is not None:
         lower, upper = ([bound / length for bound in bounds] for bounds in (box.lower, box.upper))
         box = Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]), box.periodic)
+    if contacts is not None:
+        overlap = None if contacts.overlap is None else contacts.overlap / length
+        normal = None if contacts.normal_force is None else contacts.normal_force / force
+        contacts = Contacts(contacts.pairs, overlap, normal)
     return replace(
         frame,
         time=None if frame.time is None else frame.time / time,
@@ -146,14 +150,5 @@ def scaled_frame(frame: Frame, units: Any) -> Frame:
         masses=None if frame.masses is None else frame.masses / mass,
         radii=None if frame.radii is None else frame.radii / length,
         box=box,
-        contacts=_scaled_contacts(frame.contacts, length, force),
+        contacts=contacts,
     )
-
-
-def _scaled_contacts(contacts: Contacts | None, length: float, force: float) -> Contacts | None:
-    """Overlaps and forces in other units."""
-    if contacts is None:
-        return None
-    overlap = None if contacts.overlap is None else contacts.overlap / length
-    normal = None if contacts.normal_force is None else contacts.normal_force / force
-    return Contacts(contacts.pairs, overlap, normal)
