@@ -172,8 +172,8 @@ def propagate_embedded(parts: Embedding, initial: Tensor, times: Tensor, supply:
 def flows(start: Tensor, generator: Tensor, times: Tensor) -> Tensor:
     """start exp(generator t) at each time, (*batch, time, state), from start (*batch, state).
 
-    The times are cut into stretches of equal steps. In each, the matrix exponential of the step, its squares, and products
-    that double the number of times each.
+    The times are cut into stretches of equal steps. In each, the matrix exponential of the step, where it is not at hand
+    nor that of its half, its squares, and products that double the number of times each.
 
     Raises:
         FieldError: for a time at which rounding has blurred the rates.
@@ -181,20 +181,24 @@ def flows(start: Tensor, generator: Tensor, times: Tensor) -> Tensor:
     latest = LONGEST_FLOW / max(float(generator.detach().abs().sum(-1).max()), 1e-300)
     if float(times[-1]) > latest:
         raise checks.fail("times", f"be at most {latest:.3g}, where rounding blurs these rates", float(times[-1]))
-    if float(times[0]) > 0:
-        start = start @ torch.linalg.matrix_exp(generator * times[0])
-    paths = [start[..., None, :]]
     exponentials: dict[str, Tensor] = {}
-    for step, count in equal_steps(times):
-        name = f"{step:.12g}"
+
+    def after(step: float) -> Tensor:
+        name, half = f"{step:.12g}", exponentials.get(f"{step / 2:.12g}")
         if name not in exponentials:
             if len(exponentials) == MOST_STEPS:
                 exponentials.clear()
-            exponentials[name] = torch.linalg.matrix_exp(generator * step)
-        path, power = paths[-1][..., -1:, :], exponentials[name]
+            exponentials[name] = torch.linalg.matrix_exp(generator * step) if half is None else half @ half
+        return exponentials[name]
+
+    if float(times[0]) > 0:
+        start = start @ after(float(times[0]))
+    paths = [start[..., None, :]]
+    for step, count in equal_steps(times):
+        path, power = paths[-1][..., -1:, :], after(step)
         while path.shape[-2] <= count:
             path = torch.cat([path, path[..., : count + 1 - path.shape[-2], :] @ power], dim=-2)
-            power = power @ power
+            power = power @ power if path.shape[-2] <= count else power
         paths.append(path[..., 1:, :])
     return torch.cat(paths, dim=-2)
 

@@ -34,8 +34,8 @@ LATER = ("misfit_share", "alike")
 """What older files do not know."""
 FAR, NORMAL_MEDIAN = 3.0, 0.6745
 """Deviations from the median that are cut, in standard deviations; the median size of normal ones."""
-AHEAD = 1e4
-"""Times beyond the last at which a model is looked at before it is trusted for good, up to so many times that."""
+OCTAVES = 12
+"""Doublings of twice the last time up to which a model is looked at before it is trusted for good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,13 +287,9 @@ def kept_times(times: Tensor, most: int = MOST_TIMES) -> Tensor:
 
 
 def later_times(end: float) -> Tensor:
-    """Times beyond the last at which :func:`horizon` looks, (48,): at equal steps up to twice that, and from there to each power of ten."""
-    ends = [end, 2 * end, *(end * 10.0**i for i in range(1, round(math.log10(AHEAD)) + 1))]
-    counts = [24] + [6] * (len(ends) - 2)
-    return torch.cat([
-        torch.linspace(a, b, count + (a > end), dtype=torch.float64)[a > end :]
-        for a, b, count in zip(ends[:-1], ends[1:], counts, strict=True)
-    ])  # fmt: skip
+    """Times beyond the last at which :func:`horizon` looks, (48,): 24 up to twice that, and two in every octave from there."""
+    octaves = 2.0 ** torch.arange(1, OCTAVES + 1, dtype=torch.float64)
+    return end * torch.cat([torch.linspace(1, 2, 24, dtype=torch.float64), torch.stack([1.5 * octaves, 2 * octaves], 1).flatten()])
 
 
 def horizon(transfer: BandTransfer, model: TransferModel) -> float:
