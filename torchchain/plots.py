@@ -181,11 +181,10 @@ def label_of(values: xarray.DataArray) -> str:
     return f"{name} ({units})" if units else name
 
 
-def own_axes(width: float = COLUMN, height: float = 2.7) -> Axes:
+def own_axes() -> Axes:
     """The axes of a figure of their own, a column wide."""
     with style():
-        axes = figure(width, height, 1, 1)[1]
-        return axes[0, 0]
+        return figure(COLUMN, 2.7, 1, 1)[1][0, 0]
 
 
 def decays(

@@ -45,7 +45,7 @@ def command(arguments: list[str], signals: bool = False) -> int:
         flags = _parse(arguments)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 2
-    with _one_line_warnings(), _notices(), _ends() as ends:
+    with _lines(), _ends() as ends:
         try:
             logging.getLogger("torchchain").info("loading")
             from torchchain.checks import FieldError, FieldTypeError
@@ -87,16 +87,6 @@ def _ends() -> Iterator[list[int]]:
         signal.signal(signal.SIGTERM, before)
 
 
-@contextlib.contextmanager
-def _one_line_warnings() -> Iterator[None]:
-    before = warnings.formatwarning
-    warnings.formatwarning = lambda message, *_, **__: f"torchchain: warning: {' '.join(str(message).split())}\n"
-    try:
-        yield
-    finally:
-        warnings.formatwarning = before
-
-
 class _Notices(logging.Handler):
     """Notices of the library as lines on standard error; those that only say what goes on where a person looks on."""
 
@@ -107,9 +97,11 @@ class _Notices(logging.Handler):
 
 
 @contextlib.contextmanager
-def _notices() -> Iterator[None]:
+def _lines() -> Iterator[None]:
+    """Warnings and notices are one line each until this ends."""
     log, handler = logging.getLogger("torchchain"), _Notices()
-    before = log.level, log.propagate
+    before = warnings.formatwarning, log.level, log.propagate
+    warnings.formatwarning = lambda message, *_, **__: f"torchchain: warning: {' '.join(str(message).split())}\n"
     log.addHandler(handler)
     log.setLevel(logging.INFO)
     log.propagate = False
@@ -117,7 +109,7 @@ def _notices() -> Iterator[None]:
         yield
     finally:
         log.removeHandler(handler)
-        log.level, log.propagate = before
+        warnings.formatwarning, log.level, log.propagate = before
 
 
 def _parse(arguments: list[str]) -> Any:

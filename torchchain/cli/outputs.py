@@ -38,7 +38,7 @@ LARGE, LARGEST_PIECE, MOST_PIECES = 2**18, 2**22, 64
 DPI = 200
 RECORD = "run.json"
 """Written last and removed first: where it is, all that it names is of one run."""
-Writer = Callable[[Path], None]
+Writer = Callable[[Path], object]
 
 
 def load() -> None:
@@ -167,11 +167,7 @@ def _is_alive(process: int) -> bool:
 
 def text(content: str) -> Writer:
     """A writer of a text file."""
-
-    def writer(path: Path) -> None:
-        path.write_text(content, encoding="utf-8")
-
-    return writer
+    return lambda path: path.write_text(content, encoding="utf-8")
 
 
 def dataset(data: xarray.Dataset) -> Writer:
@@ -273,24 +269,22 @@ def reported(
     }
 
     def page(path: Path) -> None:
-        told = report.page({**record, "out": str(out.absolute())}, path.parent)
-        path.write_text(told, encoding="utf-8")
+        text(report.page({**record, "out": str(out.absolute())}, path.parent))(path)
 
     def writer(path: Path) -> None:
-        files = {beside.name: sha256(beside) for beside in sorted(path.parent.iterdir())}
-        text = json.dumps(_strict({**record, "files": files}), indent=2, allow_nan=False)
-        path.write_text(text + "\n", encoding="utf-8")
+        hashes = {beside.name: sha256(beside) for beside in sorted(path.parent.iterdir())}
+        text(json.dumps(_strict({**record, "files": hashes}), indent=2, allow_nan=False) + "\n")(path)
 
     return {report.REPORT: page, RECORD: writer}
 
 
 def leave(
-    out: Path, files: dict[str, Writer], arguments: Sequence[str], config: str, device: str, began: float,
-    stages: dict[str, float], **more: Any,
+    out: Path, files: dict[str, Writer], arguments: Sequence[str], config: str, *known: Any, aside: Path | None = None,
+    **more: Any,
 ) -> None:  # fmt: skip
-    """Write the config if there is one, the files, and what :func:`reported` gives of the rest."""
-    written = reported(out, arguments, config, device, began, stages, **more)
-    write(out, {**({"config.toml": text(config)} if config else {}), **files, **written})
+    """Write the config, if it says anything, the files, and what :func:`reported` gives of the rest; see :func:`write`."""
+    written = reported(out, arguments, config, *known, **more)
+    write(out, {**({"config.toml": text(config)} if config else {}), **files, **written}, aside)
 
 
 def sha256(path: str | Path) -> str:

@@ -110,10 +110,6 @@ def _text(value: Any) -> str:
     return html.escape(str(value))
 
 
-def _shown(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
 def _block(text: str) -> str:
     return f"<pre>{_text(text.strip())}</pre>"
 
@@ -126,7 +122,8 @@ def _table(rows: Iterable[Sequence[Any]], head: Sequence[str] = ()) -> str:
     """Cells as text, numbers kept in one line."""
     lines = [f"<tr>{''.join(f'<th>{_text(name)}</th>' for name in head)}</tr>"] if head else []
     for row in rows:
-        cells = (f"<td{' class=number' if _is_number(cell) else ''}>{_text(_shown(cell))}</td>" for cell in row)
+        told = (f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row)
+        cells = (f"<td{' class=number' if _is_number(cell) else ''}>{_text(cell)}</td>" for cell in told)
         lines.append(f"<tr>{''.join(cells)}</tr>")
     return f'<div class="wide"><table>{"".join(lines)}</table></div>'
 

@@ -103,14 +103,13 @@ class Run:
     def write(
         self, files: dict[str, outputs.Writer], config: str, aside: Path | None = None, **record: Any
     ) -> None:  # fmt: skip
-        """Leave the files, the config and the record in the folder, and clear the checkpoint; see :func:`outputs.write`."""
+        """Leave the files, the config and the record in the folder, and clear the checkpoint; see :func:`outputs.leave`."""
         hashes = {name: outputs.sha256(name) for name in self.plugins if name.endswith(".py")}
-        written = outputs.reported(
-            self.out, self.arguments, config, self.device, self.began, self.stages.seconds, warnings=self.warned,
-            **({"plugins": hashes} if self.plugins else {}), **record,
-        )  # fmt: skip
         with self.stages("writing"):
-            outputs.write(self.out, {"config.toml": outputs.text(config), **files, **written}, aside)
+            outputs.leave(
+                self.out, files, self.arguments, config, self.device, self.began, self.stages.seconds,
+                aside=aside, warnings=self.warned, **({"plugins": hashes} if self.plugins else {}), **record,
+            )  # fmt: skip
         if self.checkpoint is not None:
             self.checkpoint.clear()
 

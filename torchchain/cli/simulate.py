@@ -59,12 +59,11 @@ def _leave(run: Run, scene: Scene, data: xarray.Dataset) -> None:
 
 def _last(data: xarray.Dataset, name: str) -> tuple[str, float, float] | None:
     """An observable at the last time and its standard error: the number, or the largest of several; of tones, that of the figure."""
-    values, error = data[name], data[f"{name}_stderr"]
+    values, error = _drawn(data, name)
     when = ""
     if "time" in values.dims:
         values, error, when = values.isel(time=-1), error.isel(time=-1), " at the last time"
-    if "tone" in values.dims:
-        values, error = (part.isel(tone=values.sizes["tone"] // 2) for part in (values, error))
+    if "tone" in values.coords:
         when += f", tone {int(values.tone)}"
     if values.ndim > 1:
         return None
@@ -77,6 +76,14 @@ def _last(data: xarray.Dataset, name: str) -> tuple[str, float, float] | None:
     return f"{name}{when}", float(values), float(error)
 
 
+def _drawn(data: xarray.Dataset, name: str) -> tuple[xarray.DataArray, xarray.DataArray]:
+    """An observable and its standard error, of several tones those of the one in the middle."""
+    parts = data[name], data[f"{name}_stderr"]
+    if "tone" in data[name].dims:
+        parts = parts[0].isel(tone=data.sizes["tone"] // 2), parts[1].isel(tone=data.sizes["tone"] // 2)
+    return parts
+
+
 def _largest_error(data: xarray.Dataset, names: Sequence[str]) -> float:
     """Largest standard error of the observables, each relative to its own largest value."""
     return max(float(data[f"{name}_stderr"].max()) / (float(abs(data[name]).max()) or 1.0) for name in names)
@@ -87,10 +94,9 @@ def _figure(scene: Scene, data: xarray.Dataset) -> Any:
     figure, axes = plots.figure(plots.COLUMN, 2.6 * len(names) + 0.2, len(names), 1)
     times = scene.times.numpy()
     for ax, name in zip(axes[:, 0], names, strict=True):
-        values, error = data[name], data[f"{name}_stderr"]
+        values, error = _drawn(data, name)
         chosen = ""
-        if "tone" in values.dims:
-            values, error = (part.isel(tone=len(scene.tones) // 2) for part in (values, error))
+        if "tone" in values.coords:
             tone = int(values.tone)
             chosen = f"tone {tone}"
             if scene.lattices is not None:

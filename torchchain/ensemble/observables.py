@@ -20,7 +20,6 @@ from torchchain.network import systems
 from torchchain.network.lattices import Lattice
 from torchchain.network.trajectories import NetworkTrajectory
 from torchchain.species.energy import species_band_energy, species_energy
-from torchchain.species.mixtures import MixedChain
 
 if TYPE_CHECKING:
     from torchchain.ensemble.scene import Scene
@@ -108,10 +107,6 @@ def _energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
     return spreading.particle_energy(chain, trajectory, scene.energy_definition)
 
 
-def _source_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
-    return _energy(scene, chain, trajectory)[..., scene.site - 1]
-
-
 def _dissipated(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
     if isinstance(chain, Lattice):
         return spreading.total_energy(chain, _start(scene, chain, trajectory)) - spreading.total_energy(chain, trajectory)
@@ -123,12 +118,10 @@ def _openings(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
     return none if trajectory.openings is None else trajectory.openings.to(none)
 
 
-def _band_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
+def _band_energy(scene: Scene, chain: Any, trajectory: Trajectory) -> Tensor:
     """Share of the energy, of that at the start where damping takes some of it."""
     if scene.by_species:
-        mixed, labels, count = _of_species(scene, chain)
-        each = species_band_energy(mixed, trajectory, labels, count, scene.bands_each)
-        share = each.flatten(-2)
+        share = species_band_energy(chain, trajectory, chain.labels, len(scene.species), scene.bands_each).flatten(-2)
     else:
         share = systems.band_energy(
             chain, trajectory, scene.n_bands, scene.largest_damping == 0, _of_wavenumbers(scene)
@@ -153,26 +146,9 @@ def _start(scene: Scene, chain: System, trajectory: Trajectory) -> Trajectory:
     return kind(trajectory.times[:1], *fields)
 
 
-def _long_time_band_energy(scene: Scene, chain: System, state: State, modes: Any) -> Tensor:
-    definition = _of_wavenumbers(scene)
-    return systems.long_time_band_energy(chain, state, scene.n_bands, modes=modes, definition=definition)
-
-
 def _of_wavenumbers(scene: Scene) -> str:
     """The definition of energies over wavenumbers; lattices have one."""
     return scene.energy_definition if scene.lattice is None else "site"
-
-
-def _of_species(scene: Scene, chain: System) -> tuple[MixedChain, Tensor, int]:
-    """The chain, the species of its beads, and how many there are."""
-    assert isinstance(chain, MixedChain), "of mixtures"
-    assert chain.labels is not None, "drawn with them"
-    return chain, chain.labels, len(scene.species)
-
-
-def _species_energy(scene: Scene, chain: System, trajectory: Trajectory) -> Tensor:
-    mixed, labels, count = _of_species(scene, chain)
-    return species_energy(mixed, trajectory, labels, count, scene.energy_definition)
 
 
 def _profile(scene: Scene, network: Lattice, trajectory: Trajectory) -> Tensor:
@@ -228,7 +204,8 @@ for _one in (
     Observable("energy", ("time", "particle"), _JOULE, "energy per particle", _energy, local=True, passes=16),
     Observable(
         "long_time_band_energy", ("band",), "1", "infinite-time average of the share of the energy in a band",
-        average=_long_time_band_energy, wavenumbers=True, bands=True, damped=False,
+        average=lambda s, c, start, modes: systems.long_time_band_energy(c, start, s.n_bands, True, modes, _of_wavenumbers(s)),
+        wavenumbers=True, bands=True, damped=False,
     ),
     Observable(
         "front", ("time",), "particle distance", "radius about the source that holds 0.99 of the energy",
@@ -245,11 +222,12 @@ for _one in (
         lambda s, c, t: spreading.energy_radius(c, _energy(s, c, t), s.site), kinds=LATTICES,
     ),
     Observable(
-        "source_energy", ("time",), _JOULE, "energy of the source particle", _source_energy, local=True, passes=14
+        "source_energy", ("time",), _JOULE, "energy of the source particle",
+        lambda s, c, t: _energy(s, c, t)[..., s.site - 1], local=True, passes=14,
     ),
     Observable(
         "species_energy", ("time", "species"), _JOULE, "energy of each species",
-        _species_energy, passes=20, kinds=MIXTURES,
+        lambda s, c, t: species_energy(c, t, c.labels, len(s.species), s.energy_definition), passes=20, kinds=MIXTURES,
     ),
     Observable(
         "spread", ("time",), "particle distance^2", "mean squared distance r^2 of the energy from the source",
@@ -281,15 +259,9 @@ def is_fused(method: str, scene: Scene) -> bool:
     kinds = {entry.kernel for entry in chosen_observables(scene.observables) if entry.in_time}
     if method != "chebyshev" or scene.lattice is not None or scene.by_species:
         return False
-    return kinds == {"bands"} or kinds <= MOMENTS or (kinds <= BANDS and _has_uniform_rings(scene))
-
-
-def _has_uniform_rings(scene: Scene) -> bool:
-    """Whether standing waves run on rings of equal contacts, whose energy is counted by sites."""
-    return (
-        scene.boundary == "periodic"
-        and scene.stiffness_disorder is None
-        and not scene.species
-        and scene.energy_definition == "site"
-        and isinstance(scene.excitation, StandingWave)
-    )
+    if kinds == {"bands"} or kinds <= MOMENTS:
+        return True
+    # Of kicks, too, where standing waves run on rings of equal contacts, whose energy is counted by sites.
+    needed = {"boundary": "periodic", "stiffness_disorder": None, "species": (), "energy_definition": "site"}
+    uniform = all(getattr(scene, name) == value for name, value in needed.items())
+    return uniform and kinds <= BANDS and isinstance(scene.excitation, StandingWave)
