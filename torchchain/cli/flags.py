@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -124,8 +125,7 @@ class SceneFlags:
 
     def overrides(self) -> dict[str, Any]:
         """The flags of the scene that were given, as nested plain values."""
-        scene = {entry.name for entry in dataclasses.fields(SceneFlags)} - {"config", "plugin"}
-        return {name: value for name, value in given(self).items() if name in scene}
+        return given(self, {entry.name for entry in dataclasses.fields(SceneFlags)} - {"config", "plugin"})
 
 
 @dataclass(frozen=True)
@@ -179,8 +179,8 @@ class Calibrate(RunFlags):
 
     def calibration(self) -> dict[str, Any]:
         """The flags of the fit that were given."""
-        fit = ("fit", "model", "window", "constraint", "penalty", "bootstrap", "starts")
-        return {"method" if name == "fit" else name: value for name, value in given(self).items() if name in fit}
+        found = given(self, ("fit", "model", "window", "constraint", "penalty", "bootstrap", "starts"))
+        return {"method" if name == "fit" else name: value for name, value in found.items()}
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class Predict:
 
     def overrides(self) -> dict[str, Any]:
         """The flags of the request that were given, as nested plain values."""
-        return {k: v for k, v in given(self).items() if k in ("strength", "source", "initial", "times", "excitation")}
+        return given(self, ("strength", "source", "initial", "times", "excitation"))
 
 
 @dataclass(frozen=True)
@@ -370,13 +370,13 @@ def names(record: Any, prefix: str = "--") -> list[str]:
     return found
 
 
-def given(flags: Any) -> dict[str, Any]:
-    """The flags that were given, as nested plain values."""
+def given(flags: Any, names: Collection[str] | None = None) -> dict[str, Any]:
+    """The flags, of these or of all, that were given, as nested plain values."""
     plain: dict[str, Any] = {}
     for entry in dataclasses.fields(flags):
         value = getattr(flags, entry.name)
         if dataclasses.is_dataclass(value):
             value = given(value) or None
-        if value is not None:
+        if value is not None and (names is None or entry.name in names):
             plain[entry.name] = value
     return plain

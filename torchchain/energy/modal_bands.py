@@ -49,7 +49,8 @@ def modal_band_energy(
     modes = normal_modes(chain) if modes is None else modes
     position, speed = modal_motion(chain, state, modes)(checks.times("times", times).to(state.displacement))
     wave, momentum = _real_transform(modes.shapes), _real_transform(chain.masses[..., :, None] * modes.shapes)
-    tone = _tones(chain.n_particles, wave.device)
+    tone = torch.arange(chain.n_particles // 2 + 1, device=wave.device)
+    tone = torch.cat([tone, tone[1:-1]])  # of every column of the transforms
     # Half of the energy at k and half at -k, which are one at k = 0 and at the last tone; the last column is the total.
     weight = torch.where((tone == 0) | (2 * tone == chain.n_particles), 0.5, 1.0).to(wave)
     band = torch.nn.functional.one_hot((tone - 1).clamp(min=0) // width, n_bands).to(wave) * (tone > 0)[:, None]
@@ -69,9 +70,3 @@ def _real_transform(shapes: Tensor) -> Tensor:
     """Unitary DFT of every mode (*batch, particle, mode) as (*batch, mode, N): real parts, then imaginary parts but zero."""
     spectrum = transform(shapes.mT.contiguous())
     return torch.cat([spectrum.real, spectrum.imag[..., 1:-1]], dim=-1)
-
-
-def _tones(n_particles: int, device: torch.device) -> Tensor:
-    """The tone of every column of :func:`_real_transform`."""
-    tone = torch.arange(n_particles // 2 + 1, device=device)
-    return torch.cat([tone, tone[1:-1]])

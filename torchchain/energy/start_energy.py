@@ -40,20 +40,16 @@ class StartEnergy:
     rigid: Tensor
 
     def __post_init__(self) -> None:
-        shape = None
-        for name in ("potential", "kinetic", "virial"):
+        for name in ("potential", "kinetic", "virial", "rigid"):
             value = checks.real_tensor(name, getattr(self, name))
-            shape = tuple(value.shape) if shape is None else shape
-            if not shape or tuple(value.shape) != shape:
-                raise checks.fail(name, "have the axes (*batch, tone) of potential", value)
-            if name != "virial":
-                checks.first_bad(name, "not be negative", value, value < 0, "tone")
             object.__setattr__(self, name, value)
-        assert shape is not None, "just set"
-        rigid = checks.real_tensor("rigid", self.rigid)
-        if tuple(rigid.shape) != shape[:-1]:
-            raise checks.fail("rigid", f"have shape {shape[:-1]}", rigid)
-        object.__setattr__(self, "rigid", rigid)
+            shape = tuple(self.potential.shape)
+            if name == "rigid" and tuple(value.shape) != shape[:-1]:
+                raise checks.fail("rigid", f"have shape {shape[:-1]}", value)
+            if name != "rigid" and (not shape or tuple(value.shape) != shape):
+                raise checks.fail(name, "have the axes (*batch, tone) of potential", value)
+            if name in ("potential", "kinetic"):
+                checks.first_bad(name, "not be negative", value, value < 0, "tone")
 
     @property
     def n_particles(self) -> int:

@@ -51,10 +51,15 @@ def coordinates(scene: Scene, axes: set[str]) -> dict[str, Any]:
     """Coordinates of the given axes, counted from 1, with units."""
     n = scene.n_particles
     k = {"units": "rad / particle distance", "long_name": "wavenumber |k|"}
+    tone, band = "tone of the standing wave", "wavenumber band r"
+    if scene.lattice is not None:
+        tone, band = "band of the plane wave", "band r: shell of |q| and polarization"
+    elif scene.by_species:
+        tone, band = "band whose wave starts", "band r: species and |k|"
     every = {
         "particle": ("particle", np.arange(1, n + 1), {"long_name": "particle number p"}),
-        "tone": ("tone", np.array(scene.tones, dtype=np.int64), {"long_name": "tone of the standing wave"}),
-        "band": ("band", np.arange(1, scene.n_bands + 1), {"long_name": "wavenumber band r"}),
+        "tone": ("tone", np.array(scene.tones, dtype=np.int64), {"long_name": tone}),
+        "band": ("band", np.arange(1, scene.n_bands + 1), {"long_name": band}),
         "wavenumber": ("wavenumber", 2 * np.pi / n * np.arange(n // 2 + 1), k),
     }
     if scene.species:
@@ -70,10 +75,9 @@ def coordinates(scene: Scene, axes: set[str]) -> dict[str, Any]:
 
 
 def _of_lattices(scene: Scene, lattices: RandomLattices) -> dict[str, Any]:
-    """Coordinates that lattices have in place of a chain's, or besides."""
+    """Coordinates that lattices have besides those of chains."""
     distance = {"units": "particle distance"}
     found: dict[str, Any] = {
-        "tone": ("tone", np.array(scene.tones, dtype=np.int64), {"long_name": "band of the plane wave"}),
         "ring": ("ring", np.arange(scene.lengths["ring"]), {**distance, "long_name": "distance from the source"}),
     }
     for axis, place in zip("xyz", lattices.ordered.positions.numpy().T, strict=False):
@@ -81,11 +85,6 @@ def _of_lattices(scene: Scene, lattices: RandomLattices) -> dict[str, Any]:
     if scene.needs_bands:
         bands = lattices.bands(scene.n_bands)
         middle = (bands.edges[1:] + bands.edges[:-1]).numpy() / 2
-        found["band"] = (
-            "band",
-            np.arange(1, scene.n_bands + 1),
-            {"long_name": "band r: shell of |q| and polarization"},
-        )
         found["polarization"] = ("band", np.repeat(bands.polarizations, bands.n_shells), {"long_name": "polarization"})
         k = {"units": "rad / particle distance", "long_name": "|q| in the middle of the shell"}
         found["shell"] = ("band", np.tile(middle, len(bands.polarizations)), k)
@@ -93,7 +92,7 @@ def _of_lattices(scene: Scene, lattices: RandomLattices) -> dict[str, Any]:
 
 
 def _of_mixtures(scene: Scene) -> dict[str, Any]:
-    """Coordinates that mixtures have besides, or in place of a chain's where the energies of bands are those of each species."""
+    """Coordinates that mixtures have besides those of chains."""
     names = np.array([each.name for each in scene.species])
     found: dict[str, Any] = {"species": ("species", names, {"long_name": "species of the beads"})}
     if not scene.by_species:
@@ -102,8 +101,6 @@ def _of_mixtures(scene: Scene) -> dict[str, Any]:
     middle = np.pi / each * (np.arange(each) + 0.5)
     k = {"units": "rad / particle distance", "long_name": "|k| in the middle of the band"}
     return found | {
-        "tone": ("tone", np.array(scene.tones, dtype=np.int64), {"long_name": "band whose wave starts"}),
-        "band": ("band", np.arange(1, scene.n_bands + 1), {"long_name": "band r: species and |k|"}),
         "band_species": ("band", names.repeat(each), {"long_name": "species"}),
         "band_wavenumber": ("band", np.tile(middle, len(names)), k),
     }
