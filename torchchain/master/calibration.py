@@ -15,8 +15,7 @@ from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.certificate import certify
 from torchchain.master.certified import certified
-from torchchain.master.compact import CompactModel
-from torchchain.master.derived import TheoryModel
+from torchchain.master.compact import OddsModel
 from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import FitWarning, checked_window, within
 from torchchain.master.ladder import MODELS, fitted_by, methods
@@ -191,7 +190,7 @@ def calibrate(
             free, proof = fitted, None
         report = replace(
             report, fit=told, loss=loss_of(sample), horizon=horizon(transfer, fitted), bootstrap=count,
-            certificate=fitted.certificate if isinstance(fitted, CompactModel | TheoryModel) else proof,
+            certificate=fitted.certificate if isinstance(fitted, OddsModel) else proof,
         )  # fmt: skip
         _check_growth(fitted, asked)
         if count:

@@ -11,8 +11,7 @@ from torchchain import checks
 from torchchain.chain.excitation import StandingWave
 from torchchain.ensemble.scene import Scene
 from torchchain.master.certificate import certify
-from torchchain.master.compact import CompactModel
-from torchchain.master.derived import TheoryModel
+from torchchain.master.compact import OddsModel
 from torchchain.master.memory import MemoryModel
 from torchchain.master.model import TransferModel
 from torchchain.master.report import Calibration, Report
@@ -23,7 +22,7 @@ def coarsen(
     model: TransferModel, record: Calibration, errors: Uncertainty | None, n_bands: int
 ) -> tuple[TransferModel, Calibration, Uncertainty | None]:
     """Model, calibration and uncertainty of wider bands: transfers averaged over the sources and summed over the receivers."""
-    own = model.as_memory() if isinstance(model, CompactModel | TheoryModel) else model
+    own = model.as_memory() if isinstance(model, OddsModel) else model
     if not isinstance(own, MemoryModel):
         raise checks.fail("model", "be 'memory' to be coarsened", repr(record.model))
     n_bands = checks.integer("n_bands", n_bands, 1, model.n_bands)

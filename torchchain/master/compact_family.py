@@ -8,7 +8,7 @@ Any coefficients make a model that is never negative and conserves energy, so ev
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from torch import Tensor
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master.compact import CompactModel, checked_degrees, n_coefficients
+from torchchain.master.compact import CompactModel
 from torchchain.master.compact_record import (
     CompactReport,
     check_scene,
@@ -32,8 +32,9 @@ from torchchain.master.compact_record import (
 from torchchain.master.derived import THEORY, TheoryModel, compared
 from torchchain.master.equation import MasterEquation
 from torchchain.master.fits import linear_weights
-from torchchain.master.logistic import Regression, fit_compact, solve, stepped
+from torchchain.master.logistic import fit_compact, solve, stepped
 from torchchain.master.misfit import model_error
+from torchchain.master.polynomials import checked_degrees, n_coefficients
 from torchchain.master.report import Calibration, Report
 from torchchain.master.sample import Sample
 from torchchain.master.theory_rings import derived
@@ -113,7 +114,9 @@ def between(
     told = max(strength, THEORY_WEAKEST)
     fewer = (told**2 + beside**2) / (known[0] ** 2 + beside**2)
     if strength < known[0] and _described(scene):
-        mixed["coefficients"] = _fitted(_at(scene, told), _below(members[0], _at(scene, told), _fit_times()), BELOW)
+        mixed["coefficients"] = _fitted(
+            at_strength(scene, told), _below(members[0], at_strength(scene, told), _fit_times()), BELOW
+        )
         mixed["coefficients"] *= (strength / told) ** power
         mixed["degrees"] = torch.tensor(BELOW, dtype=torch.float64)
     elif strength < known[0]:
@@ -127,7 +130,15 @@ def between(
     return CompactModel(**tensors[0] | mixed | waves.tensors())
 
 
-def _at(scene: Scene, strength: float) -> Scene:
+def scene_of(member: MasterEquation) -> Scene:
+    """The scene that a member was calibrated on."""
+    scene = member.calibration.scene
+    assert scene is not None, "a family's constructor has checked it"
+    return scene
+
+
+def at_strength(scene: Scene, strength: float) -> Scene:
+    """The same chains with another strength of the masses' disorder."""
     return replace(scene, disorder=replace(scene.disorder, strength=strength))
 
 
@@ -138,9 +149,8 @@ def _described(scene: Scene) -> bool:
 
 def _below(lowest: MasterEquation, scene: Scene, times: Tensor, power: int = 2) -> Tensor:
     """T at a strength below the lowest: of the theory, its odds mended by some of what the lowest model tells of it."""
-    model, there = lowest.model, lowest.calibration.scene
+    model, there = lowest.model, scene_of(lowest)
     assert isinstance(model, CompactModel), "a family's constructor has checked it"
-    assert there is not None, "likewise"
     own = model.at(times.to(model.rates)).double()
     missed = [_odds(found).log() for found in (own, derived(TheoryModel.of(there).ring, times))]
     share = _shared(there, scene, times) ** (power / 2)
@@ -176,11 +186,10 @@ def _guide(scene: Scene, degrees: tuple[int, int, int]) -> Tensor:
 
 def _known_guide(member: MasterEquation, degrees: tuple[int, int, int]) -> Tensor:
     """That of a member's chains, which it holds if it was fitted in a family with these degrees."""
-    model, scene = member.model, member.calibration.scene
+    model = member.model
     if isinstance(model, CompactModel) and len(model.guide) and model.degrees_ == degrees:
         return model.guide
-    assert scene is not None, "a family's constructor has checked it"
-    return _guide(scene, degrees)
+    return _guide(scene_of(member), degrees)
 
 
 def _fit_times() -> Tensor:
@@ -204,57 +213,67 @@ def nearest(strength: float, known: Sequence[float]) -> list[float]:
     return [max(0.0, 1 - abs(place - i)) for i in range(len(known))]
 
 
-def fit_together(
-    samples: Sequence[Sample], guides: np.ndarray, degrees: tuple[int, int, int] = DEGREES, sets: int = SETS,
-    progress: Callable[[int], Any] | None = None,
-) -> tuple[np.ndarray, CompactReport]:  # fmt: skip
-    """Coefficients for every sample, (sample, coefficient), and how the regression went.
+class Together:
+    """Regressions of chains that differ in the strength of their masses' disorder.
 
     Args:
-        samples: of chains that differ in the strength of their masses' disorder, in order of it.
+        samples: of the chains, in order of it.
         guides: what the theory says of each sample, (sample, coefficient).
         degrees: of the polynomials in place, distance and time.
         sets: polynomials of sqrt(xi), no more than there are samples.
-        progress: called with 1 after every step.
     """
-    problems = [regression_of(sample, degrees).guided(guide) for sample, guide in zip(samples, guides, strict=True)]
-    mixing = _mixing(samples, sets)
-    with single_blas_thread():
-        start = None if guides.any() else _start(problems, mixing, progress)  # what the theory says is near enough
-        found, told = solve(problems, mixing, start, progress, _stiffness(mixing.shape[1]))
-    return guides + mixing @ found, CompactReport(
-        told["converged"], told["steps"], told["misfit"], degrees, mixing.shape[1]
-    )
 
+    def __init__(
+        self, samples: Sequence[Sample], guides: np.ndarray, degrees: tuple[int, int, int], sets: int = SETS
+    ) -> None:
+        strengths = [sample.strength or WEAKEST for sample in samples]
+        self._samples, self._guides, self._degrees = samples, guides, degrees
+        self._mixing = polynomials_of(strengths, strengths, min(sets, len(strengths)))
+        self._stiffness = STIFFNESS * np.arange(self._mixing.shape[1]) ** 2.0
+        self._problems = [
+            regression_of(sample, degrees).guided(guide) for sample, guide in zip(samples, guides, strict=True)
+        ]
 
-def _start(problems: Sequence[Regression], mixing: np.ndarray, progress: Callable[[int], Any] | None) -> np.ndarray:
-    """The common coefficients nearest to those of every regression alone, in units of their errors, (set, coefficient)."""
-    matrix: Any = 0.0
-    pull: Any = 0.0
-    alone = None
-    for problem, m in zip(problems, mixing, strict=True):
-        alone, _ = solve([problem], np.ones((1, 1)), alone, progress)  # from the solution of the strength before
-        table = problem.table(alone[0])
-        square, _ = problem.normal(problem.predicted(table), table)
-        matrix = matrix + np.einsum("s,z,ab->sazb", m, m, square)
-        pull = pull + np.outer(m, square @ alone[0])
-    square = matrix.reshape(pull.size, -1) + np.diag(np.repeat(_stiffness(len(pull)), pull.shape[1]))
-    return np.linalg.solve(square, pull.ravel()).reshape(pull.shape)
+    def fit(self, rates: Sequence[Tensor]) -> tuple[list[CompactModel], CompactReport]:
+        """The model of every sample, with these rates for comparison, and how the regression went."""
+        with single_blas_thread():
+            start = None if self._guides.any() else self._start()  # what the theory says is near enough
+            self._found, told = solve(self._problems, self._mixing, start, None, self._stiffness)
+        rows = self._guides + self._mixing @ self._found
+        models = [
+            CompactModel(
+                rates=slopes, degrees=torch.tensor(self._degrees, dtype=torch.float64), coefficients=torch.from_numpy(row),
+                guide=torch.from_numpy(guide), **Waves.of(sample.chains).tensors(), **loss_tensors(sample),
+            )
+            for sample, slopes, row, guide in zip(self._samples, rates, rows, self._guides, strict=True)
+        ]  # fmt: skip
+        sets = self._mixing.shape[1]
+        return models, CompactReport(told["converged"], told["steps"], told["misfit"], self._degrees, sets)
 
+    def _start(self) -> np.ndarray:
+        """The common coefficients nearest to those of every regression alone, in units of their errors, (set, coefficient)."""
+        matrix: Any = 0.0
+        pull: Any = 0.0
+        alone = None
+        for problem, m in zip(self._problems, self._mixing, strict=True):
+            alone, _ = solve([problem], np.ones((1, 1)), alone)  # from the solution of the strength before
+            table = problem.table(alone[0])
+            square, _ = problem.normal(problem.predicted(table), table)
+            matrix = matrix + np.einsum("s,z,ab->sazb", m, m, square)
+            pull = pull + np.outer(m, square @ alone[0])
+        square = matrix.reshape(pull.size, -1) + np.diag(np.repeat(self._stiffness, pull.shape[1]))
+        return np.linalg.solve(square, pull.ravel()).reshape(pull.shape)
 
-def _stiffness(sets: int) -> np.ndarray:
-    """Against changes with the strength that the data do not tell, (set,)."""
-    return STIFFNESS * np.arange(sets) ** 2.0
-
-
-def _mixing(samples: Sequence[Sample], sets: int) -> np.ndarray:
-    strengths = [sample.strength or WEAKEST for sample in samples]
-    return polynomials_of(strengths, strengths, min(sets, len(strengths)))
+    def redrawn(self, drawn: Sequence[Tensor]) -> np.ndarray:
+        """Coefficients for T of ensembles drawn again, by one step from the solution each, (sample, replica, coefficient)."""
+        shares = [shares_of(each) for each in drawn]
+        found = stepped(self._problems, self._mixing, self._found, shares, self._stiffness)
+        return self._guides[:, None] + np.einsum("ms,rsc->mrc", self._mixing, found)
 
 
 def calibrate_together(
     transfers: Sequence[BandTransfer], window: tuple[float, float], replicates: int,
-    degrees: tuple[int, int, int] | None = None, sets: int = SETS, progress: Callable[[int], Any] | None = None,
+    degrees: tuple[int, int, int] | None = None, sets: int = SETS,
 ) -> list[MasterEquation]:  # fmt: skip
     """Compact models of ensembles of several strengths, in order of them, with error bars by bootstrap of all at once.
 
@@ -262,22 +281,26 @@ def calibrate_together(
         transfers: of ensembles that differ in the strength of their masses' disorder.
         window: of the slopes that are kept for comparison.
         replicates: ensembles drawn again, 0 for no error bars.
-        degrees, sets, progress: see :func:`fit_together`.
+        degrees, sets: see :class:`Together`.
     """
     for transfer in transfers:
         check_scene(transfer.scene)
     transfers = sorted(transfers, key=lambda transfer: Sample.of(transfer).strength or 0.0)
     degrees = DEGREES if degrees is None else checked_degrees(degrees)
     samples = [Sample.of(transfer) for transfer in transfers]
-    guides = np.stack([_guide(scene, degrees).numpy() for scene in map(_scene_of, samples)])
-    found, told = fit_together(samples, guides, degrees, sets, progress)
+    together = Together(
+        samples, np.stack([_guide(sample.chains, degrees).numpy() for sample in samples]), degrees, sets
+    )
     slopes = [torch.einsum("t,str->sr", linear_weights(s.times, window), s.distribution().mean) for s in samples]
-    models = [
-        _model(sample, rates, degrees, *rows) for sample, rates, *rows in zip(samples, slopes, found, guides, strict=True)
-    ]  # fmt: skip
+    models, told = together.fit(slopes)
     errors: list[Uncertainty] | list[None] = [None] * len(models)
-    if replicates:
-        errors = _errors(transfers, samples, models, window, replicates, told.sets)
+    if replicates:  # of one step from the solution each
+        repeats = [block_draws(len(transfer.block_counts), replicates, i) for i, transfer in enumerate(transfers)]
+        drawn = [drawn_again(transfer, repeat) for transfer, repeat in zip(transfers, repeats, strict=True)]
+        errors = [
+            combined(transfer, model, redrawn(transfer, model, window, repeat, *rest), repeat)
+            for transfer, model, repeat, *rest in zip(transfers, models, repeats, drawn, together.redrawn(drawn), strict=True)
+        ]  # fmt: skip
     return [
         MasterEquation(
             model,
@@ -290,52 +313,16 @@ def calibrate_together(
     ]  # fmt: skip
 
 
-def _scene_of(sample: Sample) -> Scene:
-    assert sample.scene is not None, "check_scene has seen it"
-    return sample.scene
-
-
-def _model(
-    sample: Sample, rates: Tensor, degrees: tuple[int, int, int], coefficients: np.ndarray, guide: np.ndarray
-) -> CompactModel:
-    return CompactModel(
-        rates=rates, degrees=torch.tensor(degrees, dtype=torch.float64), coefficients=torch.from_numpy(coefficients.copy()),
-        guide=torch.from_numpy(guide.copy()), **Waves.of(_scene_of(sample)).tensors(), **loss_tensors(sample),
-    )  # fmt: skip
-
-
-def _errors(
-    transfers: Sequence[BandTransfer], samples: Sequence[Sample], models: Sequence[CompactModel],
-    window: tuple[float, float], replicates: int, sets: int,
-) -> list[Uncertainty]:  # fmt: skip
-    """Error bars of all models: the blocks of every ensemble are drawn again, each time by one step from the solution."""
-    repeats = [block_draws(len(transfer.block_counts), replicates, i) for i, transfer in enumerate(transfers)]
-    mixing = _mixing(samples, sets)
-    guides = np.stack([model.guide.numpy() for model in models])
-    problems = [
-        regression_of(sample, models[0].degrees_).guided(guide) for sample, guide in zip(samples, guides, strict=True)
-    ]
-    found = np.linalg.pinv(mixing) @ (np.stack([model.coefficients.numpy() for model in models]) - guides)
-    drawn = [drawn_again(transfer, repeat) for transfer, repeat in zip(transfers, repeats, strict=True)]
-    others = guides[:, None] + np.einsum(
-        "ms,rsc->mrc", mixing, stepped(problems, mixing, found, [shares_of(each) for each in drawn], _stiffness(sets))
-    )
-    return [
-        combined(transfer, model, redrawn(transfer, model, window, repeat, *rest), repeat)
-        for transfer, model, repeat, *rest in zip(transfers, models, repeats, drawn, others, strict=True)
-    ]
-
-
 def joined(members: Sequence[MasterEquation]) -> list[MasterEquation]:
     """Models that were calibrated each alone, fitted together to what they predict, weighted by their error bars."""
     degrees = max((m.model.degrees_ for m in members if isinstance(m.model, CompactModel)), key=sum)
     degrees = min(degrees, DEGREES, key=sum)
-    samples = [_seen(member) for member in members]
     guides = np.stack([_known_guide(member, degrees).numpy() for member in members])
-    found, told = fit_together(samples, guides, degrees)
+    together = Together([_seen(member) for member in members], guides, degrees)
+    models, told = together.fit([member.rates.detach() for member in members])
     again = []
-    for member, sample, row, guide in zip(members, samples, found, guides, strict=True):
-        model, errors = _model(sample, member.rates.detach(), told.degrees, row, guide), member.uncertainty
+    for member, model in zip(members, models, strict=True):
+        errors = member.uncertainty
         if errors is not None:
             before, now = (each.transfer(errors.times).detach() for each in (member.model, model))
             noise, misfit = errors.parts(errors.times)
@@ -351,8 +338,7 @@ def joined(members: Sequence[MasterEquation]) -> list[MasterEquation]:
 
 def _seen(member: MasterEquation) -> Sample:
     """What a model predicts, as a sample of its chains."""
-    scene, errors = member.calibration.scene, member.uncertainty
-    assert scene is not None, "a family's constructor has checked it"
+    scene, errors = scene_of(member), member.uncertainty
     times, damped = scene.times if errors is None else errors.times, scene.damping > 0
     late = None if damped else member.basis.detach()
     return Sample(
@@ -375,7 +361,7 @@ def errors_between(
     known, strength = [member.calibration.strength or WEAKEST for member in members], scene.disorder.strength
     shares = nearest(strength, known)
     guided = strength < known[0] and _described(scene)
-    told = _at(scene, max(strength, THEORY_WEAKEST))
+    told = at_strength(scene, max(strength, THEORY_WEAKEST))
     nearer = held[shares.index(max(shares))][1]
     times, eye = nearer.times, torch.eye(model.n_bands, dtype=torch.float64)
     here = model.transfer(times).detach()
@@ -389,7 +375,7 @@ def errors_between(
             missed += by_misfit.sqrt() * scale
             bases += (errors.basis_stderr * late).square()
             slopes += (weight * errors.rates_stderr).square()
-    less = _shared(_at(scene, known[0]), told, times) if guided else torch.ones_like(here)
+    less = _shared(at_strength(scene, known[0]), told, times) if guided else torch.ones_like(here)
     noise, misfit = noise * less.square(), (missed * less).square()
     if strength not in known and sets > 1:
         guide = model.guide if len(model.guide) else None

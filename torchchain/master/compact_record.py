@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,19 +12,21 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master.compact import CompactModel, checked_degrees, n_coefficients
+from torchchain.master.compact import CompactModel
 from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import BEYOND, Regression, chosen_times, fit_compact, regression, stepped
 from torchchain.master.loss import mixture
 from torchchain.master.model import TransferModel
+from torchchain.master.polynomials import checked_degrees, n_coefficients
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.sample import Sample, block_weights
 from torchchain.master.waves import Waves
 from torchchain.threads import single_blas_thread
 
-Degrees = TypeVar("Degrees", bound=tuple[int, ...])
 LADDER = ((4, 3, 6), (6, 4, 8), (8, 6, 12), (10, 7, 14), (10, 7, 20), (14, 10, 20))
 """Degrees in place, distance and time that are tried one after the other: 53 to 480 fitted numbers, and 806."""
+WINDOWS = (1.0, 5.0, 50.0)
+"""Ends of the windows of time in each of which models of odds are held to the ensemble's error."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,14 @@ class CompactSettings:
         degrees: in place, distance and time; None for the smallest that reach the ensemble's own error.
     """
 
-    degrees: tuple[int, int, int] | None = None
+    degrees: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.degrees is not None:
-            object.__setattr__(self, "degrees", checked_degrees(self.degrees))
+            object.__setattr__(self, "degrees", self._checked())
+
+    def _checked(self) -> tuple[int, ...]:
+        return checked_degrees(self.degrees)
 
 
 @dataclass(frozen=True)
@@ -51,14 +55,14 @@ class CompactReport:
         converged: whether it ended by itself.
         steps: that it took.
         misfit: root mean square, in units of the error.
-        degrees: of the polynomials in place, distance and time.
+        degrees: of the settings.
         sets: polynomials of sqrt(xi) that the coefficients of a family are made of; 0 for a model alone.
     """
 
     converged: bool
     steps: int
     misfit: float
-    degrees: tuple[int, int, int]
+    degrees: tuple[int, ...]
     sets: int = 0
 
 
@@ -78,12 +82,11 @@ def check_scene(scene: Scene | None) -> None:
 
 def _fit(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
     check_scene(sample.scene)
-    assert sample.scene is not None, "checked"
     shares = sample.distribution()
     rates = torch.einsum("t,str->sr", linear_weights(sample.times, recipe.window), shares.mean)
     with single_blas_thread():
         model, told = fit_compact(
-            rates, Waves.of(sample.scene), recipe.settings.degrees, sample.times, shares.mean, sample.long_time,
+            rates, Waves.of(sample.chains), recipe.settings.degrees, sample.times, shares.mean, sample.long_time,
             sample.distance, _left(sample), near if isinstance(near, CompactModel) else None, progress,
         )  # fmt: skip
     model = CompactModel(**model.tensors() | loss_tensors(sample))
@@ -132,17 +135,18 @@ def loss_tensors(sample: Sample, mean: Tensor | None = None) -> dict[str, Tensor
     """
     if not sample.damped:
         return {}
-    assert sample.scene is not None, "check_scene has seen it"
     picked = chosen_times(sample.times)
     mean = sample.mean[:, picked] if mean is None else mean
-    found = mixture(mean.sum(-1).numpy(), sample.scene.damping, sample.times[picked].numpy())
-    return {"loss": torch.from_numpy(found), "contact_damping": torch.tensor(sample.scene.damping, dtype=torch.float64)}
+    found = mixture(mean.sum(-1).numpy(), sample.chains.damping, sample.times[picked].numpy())
+    return {
+        "loss": torch.from_numpy(found),
+        "contact_damping": torch.tensor(sample.chains.damping, dtype=torch.float64),
+    }
 
 
 def regression_of(sample: Sample, degrees: tuple[int, int, int]) -> Regression:
     """The regression of a sample of chains of a scene; of damped ones, of the shares of what is left."""
-    assert sample.scene is not None, "check_scene has seen it"
-    waves, late, distance = Waves.of(sample.scene), sample.long_time, sample.distance
+    waves, late, distance = Waves.of(sample.chains), sample.long_time, sample.distance
     return regression(waves, degrees, sample.times, sample.distribution().mean, late, distance, _left(sample))
 
 
@@ -160,18 +164,16 @@ def replicas(transfer: BandTransfer, recipe: Recipe, model: CompactModel, repeat
     yield from redrawn(transfer, model, recipe.window, repeats, drawn, others)
 
 
-def told_apart(ladder: Sequence[Degrees], n_times: int) -> list[Degrees]:
-    """Of degrees in place, distance, time and more those that so many times can tell apart, the smallest at least."""
-    return [degrees for degrees in ladder if degrees == ladder[0] or 2 * degrees[2] <= n_times]
-
-
-def _rungs(n_times: int) -> list[CompactSettings]:
-    return [CompactSettings(degrees) for degrees in told_apart(LADDER, n_times)]
+def rungs_of(
+    settings: type[CompactSettings], ladder: Sequence[tuple[int, ...]]
+) -> Callable[[int], list[CompactSettings]]:
+    """Settings of the degrees in place, distance, time and more that so many times can tell apart, the smallest at least."""
+    return lambda n_times: [settings(each) for each in ladder if each == ladder[0] or 2 * each[2] <= n_times]
 
 
 COMPACT = ReducedModel(
     "compact", "odds of damped beats times exponentials of polynomials: a few hundred numbers, never negative", CompactModel,
     (Fit("logistic", "logistic regression on all times", _fit, settings=CompactSettings, report=CompactReport),),
     lambda n_bands, damped, settings: n_coefficients(settings.degrees or LADDER[0]), climbed_by="logistic", default=True,
-    needs_long_time=True, needs_strength=True, fits_loss=True, rungs=_rungs, check_scene=check_scene, windows=(1.0, 5.0, 50.0), never_negative=True, replicas=replicas,
+    needs_long_time=True, needs_strength=True, fits_loss=True, rungs=rungs_of(CompactSettings, LADDER), check_scene=check_scene, windows=WINDOWS, never_negative=True, replicas=replicas,
 )  # fmt: skip

@@ -24,17 +24,16 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
-from torchchain.master.compact import clock_of, nearest_memory, polynomials, power, terms
-from torchchain.master.compact_record import CompactReport, CompactSettings, drawn_again, told_apart
+from torchchain.master.compact import OddsModel
+from torchchain.master.compact_record import WINDOWS, CompactReport, CompactSettings, drawn_again, rungs_of
 from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import BEYOND, Regression, fit_points, solve, stepped
-from torchchain.master.memory import MemoryModel
-from torchchain.master.model import Embedding, TransferModel
-from torchchain.master.proof import Certificate
+from torchchain.master.model import TransferModel, shaped
+from torchchain.master.polynomials import checked_degrees, factors, n_coefficients, shapes
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
-from torchchain.master.ringing import Degrees, Ringing, RingingRegression, checked, size_of, smooth_of
+from torchchain.master.ringing import Degrees, Ringing, RingingRegression, checked_ringing, size_of, smooth_of
 from torchchain.master.sample import Sample
-from torchchain.master.theory_rings import Ring, derived, shapes
+from torchchain.master.theory_rings import Ring, derived
 from torchchain.master.uncertainty import later_times
 from torchchain.theory.ladder import Waves
 from torchchain.theory.law import Law
@@ -55,7 +54,7 @@ MOST_RINGING_BANDS = 64
 RATE_TIMES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)  # of the slopes that stand for rates
 
 
-class TheoryModel(TransferModel):
+class TheoryModel(OddsModel):
     """The transfer of the theory, times exponentials of polynomials where it has coefficients (see the module).
 
     Args:
@@ -66,7 +65,7 @@ class TheoryModel(TransferModel):
         contact_damping: of the contacts.
         degrees: of the polynomials in place, distance and time, (3,); (0,) for none; of one that rings also of the ringing's
             polynomials and of how many frequencies, (5,).
-        coefficients: of :func:`torchchain.master.compact.terms`, then of the ringing by beat and product, (term,).
+        coefficients: of :func:`torchchain.master.polynomials.terms`, then of the ringing by beat and product, (term,).
 
     Example:
         >>> model = tc.master.TheoryModel.of(tc.Scene(n_particles=64, n_bands=8, disorder=tc.Disorder(strength=0.2)))
@@ -79,8 +78,6 @@ class TheoryModel(TransferModel):
         "law_values": ("node",), "law_weights": ("node",), "n_particles": (), "tones": ("band",), "dual": (),
         "contact_damping": (), "degrees": ("degree",), "coefficients": ("term",),
     }  # fmt: skip
-    rates_meaning: ClassVar[str] = MemoryModel.rates_meaning
-    has_equation: ClassVar[bool] = False
 
     def __init__(
         self, law_values: Tensor, law_weights: Tensor, n_particles: Tensor, tones: Tensor, dual: Tensor,
@@ -102,17 +99,14 @@ class TheoryModel(TransferModel):
         if not bands or n % (2 * bands) or [(tone - 1) // (n // 2 // bands) for tone in numbers] != list(range(bands)):
             raise checks.fail("tones", "lie one in each band, in order", numbers)
         loss = checks.number("contact_damping", float(contact_damping), at_least=0)
-        self.degrees_ = None if len(degrees) == 1 else checked([int(degree) for degree in degrees])
+        check = checked_ringing if len(degrees) == 5 else checked_degrees
+        self.degrees_ = None if len(degrees) == 1 else check([int(degree) for degree in degrees])
         size = 0 if self.degrees_ is None else size_of(self.degrees_)
-        coefficients = checks.real_tensor("coefficients", coefficients)
-        if tuple(coefficients.shape) != (size,):
-            raise checks.fail("coefficients", f"have shape {(size,)}", f"shape {tuple(coefficients.shape)}")
+        self._hold(coefficients=shaped("coefficients", coefficients, (size,)))
         self.ring = Ring(
             tuple(values.double().tolist()), tuple(weights.double().tolist()), n, bands, numbers,
             bool(float(dual)), loss,
         )  # fmt: skip
-        self.register_buffer("coefficients", coefficients.detach().clone())
-        self.coefficients: Tensor
 
     @classmethod
     def of(cls, scene: Scene, degrees: Degrees | None = None, coefficients: Tensor | None = None) -> TheoryModel:
@@ -152,20 +146,8 @@ class TheoryModel(TransferModel):
         return f"the theory's, degrees {self.degrees_}, {self.n_parameters} fitted numbers"
 
     @property
-    def conservation_defect(self) -> float:
-        """Rows are divided by their sum."""
-        return 0.0
-
-    @property
-    def certificate(self) -> Certificate:
-        """By construction, for every t >= 0; the energy of damped chains falls to zero."""
-        rounding = 2 * self.n_bands * torch.finfo(self.coefficients.dtype).eps
-        return Certificate(0.0, 1.0 + rounding, math.inf if self.ring.damping else rounding, 0.0, 0)
-
-    @property
-    def damping(self) -> Tensor:  # type: ignore[override]
-        """None beside what the theory's own energies lose, [band]."""
-        return self.coefficients.new_zeros(self.n_bands)
+    def damped(self) -> bool:
+        return self.ring.damping > 0
 
     @property
     def basis(self) -> Tensor:  # type: ignore[override]
@@ -189,27 +171,16 @@ class TheoryModel(TransferModel):
         """Of each pair's odds, positive, [source, time, receiver]."""
         assert self.degrees_ is not None, "there are coefficients"
         degrees = smooth_of(self.degrees_)
-        first, own = shapes(self.ring, degrees)
-        clock = polynomials(clock_of(times), degrees[2])
-        p, q = terms(degrees)
-        smooth, rings = self.coefficients[: len(p) + len(q)], self.coefficients[len(p) + len(q) :]
-        eye = torch.eye(self.n_bands).to(like)[:, None]
-        stays = power(own.to(like), clock, smooth[len(p) :], q)
-        factor = power(first.to(like), clock, smooth[: len(p)], p) * (1 - eye) + stays * eye
+        first, own = (part.to(like) for part in shapes(self.ring.distances, degrees))
+        count = n_coefficients(degrees)
+        smooth, rings = self.coefficients[:count], self.coefficients[count:]
+        factor = factors((first, own), torch.eye(self.n_bands).to(like)[:, None], times, smooth, degrees)
         if len(rings):
             factor = factor * Ringing.of(self.ring, *self.degrees_[3:]).exponent(times, rings).exp()
         return factor
 
     def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
         return torch.einsum("...s,str->...tr", initial, self._at(times))
-
-    def as_memory(self, order: tuple[int, int] = (4, 6), span: float = 1e3) -> MemoryModel:
-        """The nearest model with memory: see :meth:`CompactModel.as_memory`."""
-        return nearest_memory(self, order, span, self.ring.damping > 0)
-
-    def embedding(self) -> Embedding:
-        """That of the nearest model with memory (:meth:`as_memory`)."""
-        return self.as_memory().embedding()
 
 
 def _whole(name: str, value: Tensor, least: int, most: int | None = None) -> int:
@@ -222,13 +193,14 @@ def compared(scene: Scene | None) -> bool:
     return scene is not None and scene.n_particles >= SHORTEST and scene.n_bands >= FEWEST_BANDS
 
 
-def check_scene(scene: Scene | None) -> None:
-    """Raise for chains that the theory does not hold for."""
+def check_scene(scene: Scene | None) -> Scene:
+    """The scene; raise for chains that the theory does not hold for."""
     if scene is None:
         raise checks.fail("transfer", "be of chains of a scene for model 'theory'", "energies without one")
     covered(scene)
     if len(scene.tones) != scene.n_bands:
         raise checks.fail("n_bands", "have one tone each for model 'theory'", scene.n_bands)
+    return scene
 
 
 def covered(scene: Scene) -> tuple[Law, Waves]:
@@ -243,14 +215,14 @@ def covered(scene: Scene) -> tuple[Law, Waves]:
     )  # fmt: skip
 
 
-def check_corrected(scene: Scene | None) -> None:
-    """Raise for chains that the corrected theory is not made for."""
-    check_scene(scene)
-    assert scene is not None, "checked"
+def check_corrected(scene: Scene | None) -> Scene:
+    """The scene; raise for chains that the corrected theory is not made for."""
+    scene = check_scene(scene)
     if scene.damping:
         raise checks.fail("damping", "be 0 for model 'corrected_theory'", scene.damping)
     if scene.n_bands < 2:
         raise checks.fail("n_bands", "be at least 2 for model 'corrected_theory'", scene.n_bands)
+    return scene
 
 
 def ringing_compared(scene: Scene | None) -> bool:
@@ -258,55 +230,25 @@ def ringing_compared(scene: Scene | None) -> bool:
     return scene is not None and compared(scene) and scene.n_bands <= MOST_RINGING_BANDS
 
 
-def check_ringing(scene: Scene | None) -> None:
-    """Raise for chains in which no clusters ring alike: those of masses, or compliances, of many values."""
-    check_corrected(scene)
-    assert scene is not None, "checked"
+def check_ringing(scene: Scene | None) -> Scene:
+    """The scene; raise for chains in which no clusters ring alike: those of masses, or compliances, of many values."""
+    scene = check_corrected(scene)
     law, _ = covered(scene)
     if not 1 < len(law.values) <= MOST_VALUES:
         raise checks.fail("disorder.kind", "be 'binary' for model 'ringing_theory'", repr(scene.disorder.kind))
+    return scene
 
 
 @dataclass(frozen=True)
-class RingingSettings:
-    """Settings of the regression.
+class RingingSettings(CompactSettings):
+    """Settings of the regression with beats: degrees also of the ringing in both places, and its frequencies."""
 
-    Attributes:
-        degrees: in place, distance and time, of the ringing in both places, and its frequencies; None for the smallest that
-            reach the ensemble's own error.
-    """
-
-    degrees: Degrees | None = None
-
-    def __post_init__(self) -> None:
-        if self.degrees is None:
-            return
-        object.__setattr__(self, "degrees", checked(self.degrees))
-        if len(self.degrees) != 5:
-            raise checks.fail("degrees", "be five integers for model 'ringing_theory'", self.degrees)
-
-
-@dataclass(frozen=True)
-class RingingReport:
-    """How the regression went.
-
-    Attributes:
-        converged: whether it ended by itself.
-        steps: that it took.
-        misfit: root mean square, in units of the error.
-        degrees: see :class:`RingingSettings`.
-    """
-
-    converged: bool
-    steps: int
-    misfit: float
-    degrees: tuple[int, ...]
+    def _checked(self) -> Degrees:
+        return checked_ringing(self.degrees)
 
 
 def _derive(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
-    check_scene(sample.scene)
-    assert sample.scene is not None, "checked"
-    return _derived_for(sample.scene, sample.times, sample.damped), None
+    return _derived_for(check_scene(sample.scene), sample.times, sample.damped), None
 
 
 def _derived_for(scene: Scene, times: Tensor, damped: bool) -> TheoryModel:
@@ -324,28 +266,26 @@ def foresee(scene: Scene) -> None:
 
 
 def _regression(sample: Sample, degrees: Degrees) -> tuple[Regression, TheoryModel]:
-    assert sample.scene is not None, "checked"
-    start = TheoryModel.of(sample.scene, degrees, torch.zeros(size_of(degrees), dtype=torch.float64))
+    start = TheoryModel.of(sample.chains, degrees, torch.zeros(size_of(degrees), dtype=torch.float64))
     times, data, weight = fit_points(sample.times, sample.mean, sample.long_time, sample.distance)
     smooth = smooth_of(degrees)
-    found = Regression.of_odds(derived(start.ring, times), shapes(start.ring, smooth), smooth, times, data, weight)
+    found = Regression.of_odds(
+        derived(start.ring, times), shapes(start.ring.distances, smooth), smooth, times, data, weight
+    )
     if len(degrees) == 5:
         found = RingingRegression.added(found, Ringing.of(start.ring, *degrees[3:]), times)
     return found, start
 
 
 def _correct(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:
-    check_corrected(sample.scene)
     degrees = recipe.settings.degrees
-    if len(degrees) == 5:
-        check_ringing(sample.scene)
+    (check_ringing if len(degrees) == 5 else check_corrected)(sample.scene)
     problem, model = _regression(sample, degrees)
     first = near.coefficients if isinstance(near, TheoryModel) and near.degrees_ == degrees else model.coefficients
     with single_blas_thread():
         found, told = solve([problem], np.ones((1, 1)), first.double().cpu().numpy()[None], progress)
     tensors = model.tensors() | {"coefficients": torch.from_numpy(found[0])}
-    report = RingingReport if len(degrees) == 5 else CompactReport
-    return TheoryModel(**tensors), report(told["converged"], told["steps"], told["misfit"], degrees)
+    return TheoryModel(**tensors), CompactReport(told["converged"], told["steps"], told["misfit"], degrees)
 
 
 def _same(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: Tensor) -> Iterator[TheoryModel]:
@@ -362,31 +302,23 @@ def _again(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: 
         yield TheoryModel(**model.tensors() | {"coefficients": torch.from_numpy(other)})
 
 
-def _rungs(n_times: int) -> list[CompactSettings]:
-    return [CompactSettings(degrees) for degrees in told_apart(LADDER, n_times)]
-
-
-def _ringing_rungs(n_times: int) -> list[RingingSettings]:
-    return [RingingSettings(degrees) for degrees in told_apart(RINGING_LADDER, n_times)]
-
-
 THEORY = ReducedModel(
     "theory", "the theory of disorder: no fitted number, and no ensemble", TheoryModel,
     (Fit("derivation", "from the law of the masses", _derive),), lambda n_bands, damped, settings: 0,
-    climbed_by="derivation", needs_strength=True, fits_loss=True, check_scene=check_scene, tried_on=compared, windows=(1.0, 5.0, 50.0),
+    climbed_by="derivation", needs_strength=True, fits_loss=True, check_scene=check_scene, tried_on=compared, windows=WINDOWS,
     near=NEAREST, never_negative=True, slow=True, replicas=_same,
 )  # fmt: skip
 CORRECTED = ReducedModel(
     "corrected_theory", "the theory times exponentials of polynomials: some tens of numbers, never negative", TheoryModel,
     (Fit("correction", "logistic regression on all times", _correct, settings=CompactSettings, report=CompactReport),),
     lambda n_bands, damped, settings: size_of(settings.degrees or LADDER[0]), climbed_by="correction",
-    needs_long_time=True, needs_strength=True, rungs=_rungs, check_scene=check_corrected, tried_on=compared, windows=(1.0, 5.0, 50.0),
+    needs_long_time=True, needs_strength=True, rungs=rungs_of(CompactSettings, LADDER), check_scene=check_corrected, tried_on=compared, windows=WINDOWS,
     near=NEAREST, never_negative=True, slow=True, replicas=_again,
 )  # fmt: skip
 RINGING = ReducedModel(
     "ringing_theory", "the corrected theory with the beats of clusters of light particles: for binary masses, never negative", TheoryModel,
-    (Fit("ringing", "regression on all times, with beats", _correct, settings=RingingSettings, report=RingingReport),),
+    (Fit("ringing", "regression on all times, with beats", _correct, settings=RingingSettings, report=CompactReport),),
     lambda n_bands, damped, settings: size_of(settings.degrees or RINGING_LADDER[0]), climbed_by="ringing",
-    needs_long_time=True, needs_strength=True, rungs=_ringing_rungs, check_scene=check_ringing, tried_on=ringing_compared, windows=(1.0, 5.0, 50.0),
+    needs_long_time=True, needs_strength=True, rungs=rungs_of(RingingSettings, RINGING_LADDER), check_scene=check_ringing, tried_on=ringing_compared, windows=WINDOWS,
     never_negative=True, slow=True, replicas=_again,
 )  # fmt: skip

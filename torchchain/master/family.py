@@ -21,17 +21,31 @@ from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master import file
 from torchchain.master.calibration import calibrate, recipe, replicates
 from torchchain.master.compact import CompactModel
-from torchchain.master.compact_family import WEAKEST, between, calibrate_together, errors_between, joined
+from torchchain.master.compact_family import (
+    WEAKEST,
+    at_strength,
+    between,
+    calibrate_together,
+    errors_between,
+    joined,
+    scene_of,
+)
 from torchchain.master.compact_family import weights as compact_weights
 from torchchain.master.compact_record import COMPACT, CompactReport
 from torchchain.master.equation import MasterEquation
 from torchchain.master.memory import MemoryModel
+from torchchain.master.model import TransferModel
 from torchchain.master.report import Loss, Report
 from torchchain.master.starts import StartModel, can_fit, fit_starts, with_errors
 from torchchain.master.starts import between as between_starts
 from torchchain.master.uncertainty import Uncertainty, of_parts
 
 NEIGHBORS = 4
+SHARED = (
+    "n_particles", "n_bands", "boundary", "contact", "damping", "stiffness_disorder", "species", "arrangement", "unlike",
+    "by_species",
+)  # fmt: skip
+"""Fields of their scenes in which members are alike."""
 MOST_KEPT = 8
 """Master equations between the members that a family keeps, the last asked for."""
 
@@ -81,22 +95,10 @@ class MasterFamily(Printed):
             scene = scene_of(member)
             if not isinstance(member.model, (CompactModel, MemoryModel)):
                 raise checks.fail("members", "have the model 'compact' or 'memory'", repr(member.calibration.model))
-            for name in (
-                "n_particles",
-                "n_bands",
-                "boundary",
-                "contact",
-                "damping",
-                "stiffness_disorder",
-                "species",
-                "arrangement",
-                "unlike",
-                "by_species",
-            ):
+            for name in SHARED:
                 if getattr(scene, name) != getattr(first, name):
-                    raise checks.fail(
-                        "members", f"have the same {name}", f"{getattr(first, name)} and {getattr(scene, name)}"
-                    )
+                    both = f"{getattr(first, name)} and {getattr(scene, name)}"
+                    raise checks.fail("members", f"have the same {name}", both)
             if replace(scene.disorder, strength=first.disorder.strength) != first.disorder:
                 raise checks.fail("members", "differ in the strength of their disorder only", f"{scene.disorder}")
         found = self.strengths
@@ -175,36 +177,23 @@ class MasterFamily(Printed):
 
     def _joined(self, strength: float, weights: dict[float, float]) -> MasterEquation:
         """At a strength that no member has."""
-        chosen = dict(zip(self.strengths, self.members, strict=True))
-        if self._sets:
-            return self._between(strength, weights)
-        parts = [(w, chosen[xi]) for xi, w in weights.items() if xi in chosen]
-        record = parts[0][1].calibration
-        scene = scene_of(parts[0][1])
-        scene = replace(scene, disorder=replace(scene.disorder, strength=strength))
-        losses = [(w, m.calibration.report.loss) for w, m in parts]
-        report = Report(
-            interpolated=tuple(weights.items()),
-            horizon=min(member.horizon for _, member in parts),
-            loss=_combined_loss(losses),
-        )
-        return MasterEquation(
-            _combined(parts, weights.get(0.0, 0.0)),
-            replace(record, scene=scene, report=report),
-            _combined_errors(parts),
-        )
-
-    def _between(self, strength: float, weights: dict[float, float]) -> MasterEquation:
-        """At a strength between those of compact models."""
-        record = self.members[0].calibration
-        scene = scene_of(self.members[0])
-        scene = replace(scene, disorder=replace(scene.disorder, strength=strength))
-        model = between(self.members, scene, self._sets)
-        report = Report(
-            fit=record.report.fit, horizon=min(member.horizon for member in self.members),
-            bootstrap=record.report.bootstrap, certificate=model.certificate, interpolated=tuple(weights.items()),
-        )  # fmt: skip
-        errors = errors_between(self.members, model, scene, self._sets)
+        parts = [
+            (weights[xi], member) for xi, member in zip(self.strengths, self.members, strict=True) if xi in weights
+        ]
+        members = [member for _, member in parts]
+        record = members[0].calibration
+        scene = at_strength(scene_of(members[0]), strength)
+        report = Report(interpolated=tuple(weights.items()), horizon=min(member.horizon for member in members))
+        model: TransferModel
+        if self._sets:  # of compact models
+            model = between(members, scene, self._sets)
+            told = record.report
+            report = replace(report, fit=told.fit, bootstrap=told.bootstrap, certificate=model.certificate)
+            errors = errors_between(members, model, scene, self._sets)
+        else:
+            model = _combined(parts, weights.get(0.0, 0.0))
+            report = replace(report, loss=_combined_loss([(w, m.calibration.report.loss) for w, m in parts]))
+            errors = _combined_errors(parts)
         return MasterEquation(model, replace(record, scene=scene, report=report), errors)
 
     def solve(self, initial: Any, times: Any, strength: float, method: str = "expm", **options: Any) -> Tensor:
@@ -253,13 +242,6 @@ class MasterFamily(Printed):
         }
 
 
-def scene_of(member: MasterEquation) -> Scene:
-    """The scene that a member was calibrated on."""
-    scene = member.calibration.scene
-    assert scene is not None, "a family's constructor has checked it"
-    return scene
-
-
 def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> MasterFamily:
     """Calibrate compact models on all transfers at once, or a model with memory on each, and join them.
 
@@ -298,13 +280,9 @@ def calibrate_family(transfers: Sequence[BandTransfer], **settings: Any) -> Mast
 
 def _combined(parts: Sequence[tuple[float, MasterEquation]], idle: float) -> MemoryModel:
     """The weighted sum of models with memory, and of the chain in which nothing moves with the weight ``idle``."""
-    models = [(weight, member.model) for weight, member in parts]
-    single, paired = [], []
-    for weight, model in models:
-        assert isinstance(model, MemoryModel), "the constructor has checked it"
-        count = len(model.decay)
-        single.append(weight * model.amplitudes[:count])
-        paired.append(weight * model.amplitudes[count:])
+    models = [(weight, member.model) for weight, member in parts if isinstance(member.model, MemoryModel)]
+    single = [weight * model.amplitudes[: len(model.decay)] for weight, model in models]
+    paired = [weight * model.amplitudes[len(model.decay) :] for weight, model in models]
 
     def joined(name: str) -> Tensor:
         return torch.cat([getattr(model, name) for _, model in models])
@@ -314,14 +292,10 @@ def _combined(parts: Sequence[tuple[float, MasterEquation]], idle: float) -> Mem
 
     basis = summed("basis")
     return MemoryModel(
-        rates=summed("rates").detach(),
-        basis=basis + idle * torch.eye(len(basis), dtype=basis.dtype),
+        rates=summed("rates").detach(), basis=basis + idle * torch.eye(len(basis), dtype=basis.dtype),
         amplitudes=torch.cat([*single, *paired]),
-        decay=joined("decay"),
-        pair_decay=joined("pair_decay"),
-        pair_frequency=joined("pair_frequency"),
-        damping=None,
-    )
+        **{name: joined(name) for name in ("decay", "pair_decay", "pair_frequency")},
+    )  # fmt: skip
 
 
 def _combined_loss(losses: Sequence[tuple[float, Loss | None]]) -> Loss | None:

@@ -11,17 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchchain.master.compact import (
+from torchchain.master.compact import CompactModel
+from torchchain.master.normal import Equations
+from torchchain.master.polynomials import (
     LARGEST_EXPONENT,
-    CompactModel,
     carried,
     checked_degrees,
     clock_of,
     polynomials,
     shapes,
+    terms,
 )
-from torchchain.master.normal import Equations, products
-from torchchain.master.waves import Waves, first_odds
+from torchchain.master.waves import Waves, all_odds
 from torchchain.threads import kept_property
 
 RIDGE = 1.0
@@ -58,10 +59,8 @@ class Regression:
     def of(
         cls, waves: Waves, degrees: tuple[int, int, int], times: Tensor, data: Tensor, weight: np.ndarray
     ) -> Regression:
-        n = len(waves.source_frequency)
-        eye = torch.eye(n, dtype=torch.float64)
-        odds = first_odds(waves, times, torch.arange(n)) * (1 - eye[:, None]) + eye[:, None]
-        return cls.of_odds(odds, shapes(waves, degrees), degrees, times, data, weight)
+        odds, _ = all_odds(waves, times, torch.arange(len(waves.source_frequency)))
+        return cls.of_odds(odds, shapes(waves.distances, degrees), degrees, times, data, weight)
 
     @classmethod
     def of_odds(
@@ -80,38 +79,52 @@ class Regression:
     @property
     def held(self) -> np.ndarray:
         """Which products of shapes and clock are coefficients, bool (term, degree)."""
-        return products(self.degrees).held
+        return terms(self.degrees).held
 
     @kept_property
     def equations(self) -> Equations:
         """The linearized problem."""
-        size, bands = len(products(self.degrees).heads), np.arange(len(self.odds))
+        size, bands = len(terms(self.degrees).heads), np.arange(len(self.odds))
         between = self.shape[..., :size].copy()
         between[bands, bands, 0] = 1.0  # any: what stays has odds of another kind
         return Equations(between, self.shape[bands, bands, size:], self.clock, self.degrees)
 
+    def _multiplied(self, coefficients: np.ndarray) -> np.ndarray:
+        """The odds times their exponentials, [source, time, receiver], for coefficients as a (term, degree) table."""
+        exponent = np.clip(self.shape @ (coefficients @ self.clock.T), -LARGEST_EXPONENT, LARGEST_EXPONENT)
+        return self.odds * np.exp(exponent).transpose(0, 2, 1)
+
     def predicted(self, coefficients: np.ndarray) -> np.ndarray:
         """T [source, time, receiver] for coefficients as a (term, degree) table."""
-        exponent = np.clip(self.shape @ (coefficients @ self.clock.T), -LARGEST_EXPONENT, LARGEST_EXPONENT)
-        moved = self.odds * np.exp(exponent).transpose(0, 2, 1)
+        moved = self._multiplied(coefficients)
         return moved / moved.sum(-1, keepdims=True)
 
     def misfit(self, coefficients: np.ndarray) -> tuple[float, np.ndarray]:
         """Weighted sum of squares with the ridge, and what was predicted."""
         found = self.predicted(coefficients)
-        return float(
-            (((found - self.data) * self.weight[..., None]) ** 2).sum() + RIDGE * (coefficients**2).sum()
-        ), found
+        missed = (self._bands(found) - self.data) * self.weight[..., None]
+        return float((missed**2).sum() + RIDGE * (coefficients**2).sum()), found
 
     def normal(self, found: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Matrix and right-hand side of the linearized problem, over the coefficients that are held."""
-        matrix = self.equations.matrix(moved(found), found, self.weight)
+        bands = self._bands(found)
+        matrix = self.equations.matrix(self._moved(found), bands, self.weight)
         matrix.flat[:: len(matrix) + 1] += RIDGE
-        return matrix, self.pull(found, self.data - found) - RIDGE * coefficients[self.held]
+        return matrix, self.pull(found, self.data - bands) - RIDGE * coefficients[self.held]
 
     def pull(self, found: np.ndarray, missed: np.ndarray) -> np.ndarray:
         """Right-hand side of what is missed, (..., source, time, receiver), over the coefficients that are held."""
-        return self.equations.pull(moved(found), found, missed * self.weight[..., None] ** 2)
+        return self.equations.pull(self._moved(found), self._bands(found), missed * self.weight[..., None] ** 2)
+
+    def _bands(self, found: np.ndarray) -> np.ndarray:
+        """What of the predicted shares is in each band, [source, time, receiver]."""
+        return found
+
+    def _moved(self, found: np.ndarray) -> np.ndarray:
+        """What has left its source's own band, or tone."""
+        moved, bands = found.copy(), np.arange(len(found))
+        moved[bands, :, bands] = 0.0
+        return moved
 
     @property
     def size(self) -> int:
@@ -120,21 +133,13 @@ class Regression:
 
     def guided(self, guide: np.ndarray) -> Regression:
         """The regression for what is to be added to known coefficients, which are multiplied into its odds."""
-        exponent = np.clip(self.shape @ (self.table(guide) @ self.clock.T), -LARGEST_EXPONENT, LARGEST_EXPONENT)
-        return replace(self, odds=self.odds * np.exp(exponent).transpose(0, 2, 1))
+        return replace(self, odds=self._multiplied(self.table(guide)))
 
     def table(self, held: np.ndarray) -> np.ndarray:
         """Coefficients as a table, zeros where none is."""
         table = np.zeros(self.held.shape)
         table[self.held] = held
         return table
-
-
-def moved(shares: np.ndarray) -> np.ndarray:
-    """What of the shares [source, time, receiver] has left its own band."""
-    found, bands = shares.copy(), np.arange(len(shares))
-    found[bands, :, bands] = 0.0
-    return found
 
 
 def solve(

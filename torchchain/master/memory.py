@@ -13,7 +13,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import linear_weights
-from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping
+from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping, checked_square
 from torchchain.master.projection import Order, Poles, Projection, search
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.sample import Sample, block_weights, exact_basis, leading_vectors
@@ -60,6 +60,11 @@ class MemoryModel(TransferModel):
         "mean slopes of the energies in the calibration's window, which the prediction does not use; "
         "not the paper's Q, which is torchchain.paper_rates(transfer)"
     )
+    amplitudes: Tensor
+    decay: Tensor
+    pair_decay: Tensor
+    pair_frequency: Tensor
+    _rates: Tensor
 
     def __init__(
         self,
@@ -72,18 +77,16 @@ class MemoryModel(TransferModel):
         damping: Tensor | None = None,
     ) -> None:
         super().__init__()
-        rates = checks.real_tensor("rates", rates)
+        rates = checked_square(rates)
         basis = checked_basis(basis, rates)
         amplitudes = checks.real_tensor("amplitudes", amplitudes).to(rates)
-        decay, pair_decay, pair_frequency = (
-            checks.real_tensor(name, value).to(rates)
-            for name, value in (("decay", decay), ("pair_decay", pair_decay), ("pair_frequency", pair_frequency))
-        )
-        for name, value in (("decay", decay), ("pair_decay", pair_decay), ("pair_frequency", pair_frequency)):
+        poles = {"decay": decay, "pair_decay": pair_decay, "pair_frequency": pair_frequency}
+        for name, value in poles.items():
+            poles[name] = value = checks.real_tensor(name, value).to(rates)
             if value.ndim != 1:
                 raise checks.fail(name, "be one-dimensional", f"shape {tuple(value.shape)}")
-        for name, value in (("decay", decay), ("pair_decay", pair_decay)):
-            checks.first_bad(name, "not be negative", value, value < 0, "function")
+            if name != "pair_frequency":
+                checks.first_bad(name, "not be negative", value, value < 0, "function")
         shape = (len(decay) + 2 * len(pair_decay), *rates.shape)
         if tuple(amplitudes.shape) != shape or pair_frequency.shape != pair_decay.shape:
             raise checks.fail("amplitudes", f"have shape {shape}", f"shape {tuple(amplitudes.shape)}")
@@ -93,17 +96,8 @@ class MemoryModel(TransferModel):
         checks.first_bad(
             "amplitudes", "add up to 1 - basis at time 0", start, (start - identity).abs() > 1e-6 * (1 + amplitudes.abs().max()), "receiver"
         )  # fmt: skip
-        self.register_buffer("_rates", rates.detach().clone())
-        for name, value in (
-            ("basis", basis), ("amplitudes", amplitudes), ("decay", decay), ("pair_decay", pair_decay),
-            ("pair_frequency", pair_frequency), ("damping", checked_damping(damping, rates)),
-        ):  # fmt: skip
-            self.register_buffer(name, value.detach().clone())
-        self._rates: Tensor
-        self.amplitudes: Tensor
-        self.decay: Tensor
-        self.pair_decay: Tensor
-        self.pair_frequency: Tensor
+        damping = checked_damping(damping, rates)
+        self._hold(_rates=rates, basis=basis, amplitudes=amplitudes, damping=damping, **poles)
 
     @property
     def rates(self) -> Tensor:

@@ -103,6 +103,11 @@ class TransferModel(nn.Module):
         """Everything that makes the model, as its constructor takes it."""
         return {name: getattr(self, name) for name in self.axes}
 
+    def _hold(self, **tensors: Tensor) -> None:
+        """Make copies of tensors part of the model."""
+        for name, value in tensors.items():
+            self.register_buffer(name, value.detach().clone())
+
     def embedding(self) -> Embedding:
         """The model as a linear differential equation with constant coefficients."""
         raise NotImplementedError
@@ -113,18 +118,29 @@ class TransferModel(nn.Module):
 
     def transfer(self, times: Tensor) -> Tensor:
         """T(t), (source, time, receiver): the propagation of a unit energy in each band."""
-        return self.propagate(torch.eye(self.n_bands, dtype=self.basis.dtype, device=self.basis.device), times)
+        return self.propagate(torch.eye(self.n_bands).to(self.basis), times)
+
+
+def shaped(name: str, value: Tensor, shape: tuple[int, ...], like: str = "") -> Tensor:
+    """A real tensor of this shape, which is that ``like`` something."""
+    value = checks.real_tensor(name, value)
+    if tuple(value.shape) != shape:
+        raise checks.fail(name, f"have shape {shape}{like}", f"shape {tuple(value.shape)}")
+    return value
+
+
+def checked_square(rates: Tensor) -> Tensor:
+    """Rates [source, receiver]."""
+    rates = checks.real_tensor("rates", rates)
+    if rates.ndim != 2 or rates.shape[0] != rates.shape[1] or not rates.numel():
+        raise checks.fail("rates", "be a square matrix", f"shape {tuple(rates.shape)}")
+    return rates
 
 
 def checked_basis(basis: Tensor, rates: Tensor) -> Tensor:
     """Pi [source, receiver] from itself or its diagonal, checked against the rates."""
-    if rates.ndim != 2 or rates.shape[0] != rates.shape[1] or not rates.numel():
-        raise checks.fail("rates", "be a square matrix", f"shape {tuple(rates.shape)}")
-    n = len(rates)
     basis = checks.real_tensor("basis", basis)
-    basis = torch.diag(basis) if basis.ndim == 1 else basis
-    if tuple(basis.shape) != (n, n):
-        raise checks.fail("basis", f"have shape {(n, n)} like the rates", f"shape {tuple(basis.shape)}")
+    basis = shaped("basis", torch.diag(basis) if basis.ndim == 1 else basis, tuple(rates.shape), " like the rates")
     total = basis.sum(-1)
     checks.first_bad("basis", "have row sums of at most 1", total, total > 1 + 1e-6, "band")
     return basis.to(rates)
@@ -132,9 +148,8 @@ def checked_basis(basis: Tensor, rates: Tensor) -> Tensor:
 
 def checked_damping(damping: Tensor | None, rates: Tensor) -> Tensor:
     """d [band], zero if None, checked against the rates."""
-    damping = torch.zeros_like(rates[0]) if damping is None else checks.real_tensor("damping", damping)
-    if tuple(damping.shape) != (len(rates),):
-        raise checks.fail("damping", f"have shape {(len(rates),)} like the rates", f"shape {tuple(damping.shape)}")
+    damping = torch.zeros_like(rates[0]) if damping is None else damping
+    damping = shaped("damping", damping, (len(rates),), " like the rates")
     checks.first_bad("damping", "not be negative", damping, damping < 0, "band")
     return damping.to(rates)
 

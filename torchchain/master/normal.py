@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 
-from torchchain.master.compact import terms
+from torchchain.master.polynomials import terms
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +31,11 @@ class Products:
     """What products of polynomials of given degrees are made of; they depend on the degrees alone.
 
     Attributes:
-        heads: (i, j) of the exponents' terms, in order.
-        held: which products of a term, first those of p and then those of q, and a P_k are coefficients, bool (term, degree).
         doubled: (i, j) of the single polynomials that products of two terms of p are sums of, (single, 2).
         sums: how much of each is in which product, (single, pair), pairs being those of the upper triangle.
         index: where in a (pair, pair of P_k) table the matrix (coefficient, coefficient) has its entries.
     """
 
-    heads: tuple[tuple[int, int], ...]
-    held: np.ndarray
     doubled: np.ndarray
     sums: np.ndarray
     index: np.ndarray
@@ -48,20 +44,15 @@ class Products:
 @functools.lru_cache(maxsize=16)
 def products(degrees: tuple[int, int, int]) -> Products:
     """The products of polynomials of these degrees in place, distance and time."""
-    p, q = terms(degrees)
-    heads = tuple(dict.fromkeys((i, j) for i, j, _ in p))
-    own = list(dict.fromkeys(i for i, _ in q))
-    rows = {head: row for row, head in enumerate([*heads, *own])}
-    held = np.zeros((len(rows), degrees[2] + 1), dtype=bool)
-    for *head, k in [*p, *q]:
-        held[rows[tuple(head) if len(head) == 2 else head[0]], k] = True
+    heads, held = terms(degrees)
     place, distance = np.array(heads).T
     one, two = np.triu_indices(len(heads))
     of_place = _linear(degrees[0])[place[one], place[two]]
     whole = np.einsum("pk,pl->pkl", of_place, _linear(degrees[1])[distance[one], distance[two]])
     doubled = np.argwhere((whole != 0).any(0))
     # p with p in its upper triangle, p with q, q with q in its upper triangle
-    size, first, last = len(rows), len(heads), len(own)
+    size, first = len(held), len(heads)
+    last = size - first
     pair = np.empty((size, size), dtype=np.int64)
     pair[:first, :first] = _triangle(first)
     pair[:first, first:] = len(one) + np.arange(first * last).reshape(first, last)
@@ -70,7 +61,7 @@ def products(degrees: tuple[int, int, int]) -> Products:
     term, time = held.nonzero()
     times = _triangle(held.shape[1])
     index = pair[term[:, None], term] * (times.max() + 1) + times[time[:, None], time]
-    return Products(heads, held, doubled, np.ascontiguousarray(whole[:, doubled[:, 0], doubled[:, 1]].T), index)
+    return Products(doubled, np.ascontiguousarray(whole[:, doubled[:, 0], doubled[:, 1]].T), index)
 
 
 def _triangle(size: int) -> np.ndarray:
@@ -111,7 +102,7 @@ class Equations:
         place, distance, time = degrees
         self._products = products((place, distance, time))
         self._between, self._own, self._clock = between, own, clock
-        heads = self._products.heads
+        heads, self._held = terms((place, distance, time))
         size = between[..., heads.index((0, 0))]  # e
         u, v = (between[..., heads.index(head)] / size for head in ((1, 0), (0, 1)))
         i, j = self._products.doubled.T
@@ -126,7 +117,7 @@ class Equations:
             odds, shares: f and F, (source, time, band).
             weight: (source, time).
         """
-        one, two = np.triu_indices(len(self._products.heads))
+        one, two = np.triu_indices(self._between.shape[-1])
         heavy, times = weight[..., None] ** 2 * odds, odds.shape[1]
         d, e = heavy * odds, heavy * shares
         whole = ((weight[..., None] * shares) ** 2).sum(-1)
@@ -157,4 +148,4 @@ class Equations:
         first -= np.einsum("...st,stp->...tp", total, mean)
         second = -np.swapaxes(forced.sum(-1) - total * moved, -1, -2) @ self._own
         table = np.swapaxes(np.concatenate([first, second], axis=-1), -1, -2) @ self._clock
-        return table[..., self._products.held]
+        return table[..., self._held]

@@ -22,7 +22,15 @@ from torchchain.master.fits import (
     nonlinear_rates,
     profile,
 )
-from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping, flows, swing_in_generator
+from torchchain.master.model import (
+    Embedding,
+    TransferModel,
+    checked_basis,
+    checked_damping,
+    checked_square,
+    flows,
+    swing_in_generator,
+)
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.sample import Sample
 from torchchain.threads import single_thread
@@ -59,11 +67,9 @@ class RateModel(TransferModel):
 
     def __init__(self, rates: Tensor, basis: Tensor, damping: Tensor | None = None) -> None:
         super().__init__()
-        rates = checks.real_tensor("rates", rates)
-        basis = checked_basis(basis, rates)
+        rates = checked_square(rates)
         self._rates = nn.Parameter(rates.detach().clone())
-        self.register_buffer("basis", basis.detach().clone())
-        self.register_buffer("damping", checked_damping(damping, rates).detach().clone())
+        self._hold(basis=checked_basis(basis, rates), damping=checked_damping(damping, rates))
 
     @property
     def rates(self) -> Tensor:
@@ -120,6 +126,7 @@ class SwingInModel(RateModel):
 
     kind: ClassVar[str] = "swing_in"
     axes: ClassVar[dict[str, tuple[str, ...]]] = {**RateModel.axes, "delay": ("band",)}
+    delay: Tensor
 
     def __init__(self, rates: Tensor, basis: Tensor, delay: Tensor, damping: Tensor | None = None) -> None:
         super().__init__(rates, basis, damping)
@@ -127,8 +134,7 @@ class SwingInModel(RateModel):
         if delay.ndim > 1 or delay.numel() not in (1, self.n_bands):
             raise checks.fail("delay", f"be a number or have shape ({self.n_bands},)", f"shape {tuple(delay.shape)}")
         checks.first_bad("delay", "be positive", delay, delay <= 0, "band")
-        self.register_buffer("delay", delay.detach().clone().reshape(-1).expand(self.n_bands).contiguous())
-        self.delay: Tensor
+        self._hold(delay=delay.reshape(-1).expand(self.n_bands).contiguous())
 
     @property
     def n_parameters(self) -> int:

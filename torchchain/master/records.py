@@ -115,7 +115,7 @@ class ReducedModel:
     fits_loss: bool = False
     rungs: Callable[[int], Sequence[Any]] = lambda n_times: (NoSettings(),)
     tried_on: Callable[[Scene | None], bool] = lambda scene: True
-    check_scene: Callable[[Scene | None], None] = lambda scene: None
+    check_scene: Callable[[Scene | None], Any] = lambda scene: None
     windows: tuple[float, ...] = ()
     near: float = 1.25
     never_negative: bool = False

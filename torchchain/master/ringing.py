@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.master.compact import LARGEST_EXPONENT, checked_degrees, n_coefficients, polynomials
 from torchchain.master.logistic import RIDGE, Regression
+from torchchain.master.polynomials import LARGEST_EXPONENT, checked_degrees, n_coefficients, polynomials
 from torchchain.master.theory_rings import Ring
 
 DECAY, RISE = 0.15, 2.0
@@ -36,12 +36,12 @@ Degrees = tuple[int, ...]
 """In place, distance and time; where clusters ring, in both places and how many frequencies, too."""
 
 
-def checked(degrees: Any) -> Degrees:
-    """Three degrees of a correction, or five of one that rings."""
-    if isinstance(degrees, (tuple, list)) and len(degrees) == 5:
-        degree = checks.integer("degrees", degrees[3], 0, 20)
-        return (*checked_degrees(degrees[:3]), degree, checks.integer("degrees", degrees[4], 1, MOST_FREQUENCIES))
-    return checked_degrees(degrees)
+def checked_ringing(degrees: Any) -> Degrees:
+    """Five degrees of a correction that rings."""
+    if not isinstance(degrees, (tuple, list)) or len(degrees) != 5:
+        raise checks.fail("degrees", "be five integers for model 'ringing_theory'", degrees)
+    degree = checks.integer("degrees", degrees[3], 0, 20)
+    return (*checked_degrees(degrees[:3]), degree, checks.integer("degrees", degrees[4], 1, MOST_FREQUENCIES))
 
 
 def smooth_of(degrees: Degrees) -> tuple[int, int, int]:

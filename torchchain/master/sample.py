@@ -71,6 +71,12 @@ class Sample:
         return replace(cls.of(transfer), mean=mean, long_time=long_time)
 
     @property
+    def chains(self) -> Scene:
+        """The scene of chains that have one."""
+        assert self.scene is not None, "the model's check of the scene has seen it"
+        return self.scene
+
+    @property
     def n_bands(self) -> int:
         return self.mean.shape[-1]
 

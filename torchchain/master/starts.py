@@ -27,9 +27,9 @@ from torchchain.ensemble.starts import KINDS
 from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.alike import variance
-from torchchain.master.compact import checked_degrees, n_coefficients
 from torchchain.master.logistic import BEYOND, chosen_times, solve
 from torchchain.master.misfit import model_error
+from torchchain.master.polynomials import checked_degrees, n_coefficients
 from torchchain.master.tones import ONSET, ToneRegression, Tones, shares
 from torchchain.master.uncertainty import Uncertainty
 from torchchain.threads import single_blas_thread

@@ -1,5 +1,4 @@
-"""The theory's transfer of a ring, computed once for all that ask for the same times, and softened so that nothing is negative,
-with the places of its bands in a correction."""
+"""The theory's transfer of a ring, computed once for all that ask for the same times, and softened so that nothing is negative."""
 
 from __future__ import annotations
 
@@ -10,7 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchchain.master.compact import polynomials, terms
 from torchchain.theory.ladder import Waves
 from torchchain.theory.law import Law
 from torchchain.theory.transfer import TheoryTransfer, transfer_of_law
@@ -45,6 +43,17 @@ class Ring:
     tones: tuple[int, ...]
     dual: bool
     damping: float
+
+    @property
+    def distances(self) -> Tensor:
+        """Logarithms of those of wavenumbers over the widths of lines in Born's approximation, xi^2 tan^2(k/2), from 0 to 1, [source, receiver]."""
+        values, weights = (torch.tensor(x, dtype=torch.float64) for x in (self.values, self.weights))
+        mean = float((weights * values).sum())
+        spread = float((weights * (values - mean).square()).sum())
+        k = 2 * math.pi / self.n_particles * torch.tensor(self.tones, dtype=torch.float64)
+        width = spread * torch.tan(k.clamp(max=0.9 * math.pi) / 2).square() + FIRST_ROOM
+        far = torch.asinh((k[:, None] - k).abs() / (width[:, None] + width))
+        return far / far.max().clamp(min=1e-9)
 
 
 def _derived(ring: Ring, times: Tensor) -> TheoryTransfer:
@@ -82,23 +91,3 @@ def _positive(mean: Tensor, ring: Ring, times: Tensor) -> Tensor:
     start[rows, own] = 1.0
     softened[:, times == 0] = start[:, None]
     return softened
-
-
-def shapes(ring: Ring, degrees: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    """Polynomials of place and distance for each pair, [source, receiver, term], and of place, [source, 1, term].
-
-    Distances are those of the wavenumbers over the widths of the lines in Born's approximation, xi^2 tan^2(k/2).
-    """
-    n, size = ring.n_bands, ring.n_particles
-    values, weights = (torch.tensor(x, dtype=torch.float64) for x in (ring.values, ring.weights))
-    mean = float((weights * values).sum())
-    spread = float((weights * (values - mean).square()).sum())
-    k = 2 * math.pi / size * torch.tensor(ring.tones, dtype=torch.float64)
-    width = spread * torch.tan(k.clamp(max=0.9 * math.pi) / 2).square() + FIRST_ROOM
-    far = torch.asinh((k[:, None] - k).abs() / (width[:, None] + width))
-    far = far / far.max().clamp(min=1e-9)
-    band = torch.arange(n, dtype=torch.float64) / max(n - 1, 1)
-    place, distance = polynomials((band[:, None] + band) / 2, degrees[0]), polynomials(far, degrees[1])
-    p, _ = terms(degrees)
-    pairs = list(dict.fromkeys((i, j) for i, j, _ in p))
-    return torch.stack([place[..., i] * distance[..., j] for i, j in pairs], -1), polynomials(band, degrees[0])[:, None]

@@ -25,10 +25,11 @@ import torch
 from torch import Tensor
 
 from torchchain.ensemble.starts import KINDS
-from torchchain.master.compact import LARGEST_EXPONENT, clock_of, polynomials, terms
-from torchchain.master.logistic import RIDGE
-from torchchain.master.normal import Equations, products
+from torchchain.master.logistic import Regression
+from torchchain.master.normal import Equations
+from torchchain.master.polynomials import clock_of, of_pairs, polynomials, power, terms
 from torchchain.master.waves import WIDTH, poles, scattered
+from torchchain.threads import kept_property
 
 ONSET = 0.1
 """S0, chosen among 0.03, 0.1 and 0.3 on two ensembles at disorder 0.3."""
@@ -102,15 +103,9 @@ class Tones:
         low, high = whole[whole > 0].min(), whole.max()
         distance = ((self._distance(numbers) - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
         middle = (place[numbers][:, None] + place.reshape(self.n_bands, -1).mean(1)) / 2
-        u, v, own = (
-            polynomials(x, degree)
-            for x, degree in ((middle, degrees[0]), (distance, degrees[1]), (place[numbers], degrees[0]))
-        )
-        p, _ = terms(degrees)
-        pairs = list(dict.fromkeys((i, j) for i, j, _ in p))
-        between = torch.stack([u[..., i] * v[..., j] for i, j in pairs], dim=-1)
+        between, own = of_pairs(middle, distance, degrees), polynomials(place[numbers], degrees[0])
         upper = torch.cat([between, between.new_zeros(*between.shape[:-1], own.shape[-1])], -1)
-        lower = torch.cat([own.new_zeros(len(own), len(pairs)), own], -1)
+        lower = torch.cat([own.new_zeros(len(own), between.shape[-1]), own], -1)
         end = self.odds(KINDS[0], numbers, place.new_full((1,), math.inf)).sum((1, 2))
         return torch.cat([upper, lower[:, None]], dim=1) * (end / (end + self.onset))[:, None, None]
 
@@ -135,12 +130,7 @@ def shares(
     tones: Tones, kind: str, degrees: tuple[int, int, int], coefficients: Tensor, numbers: Tensor, times: Tensor
 ) -> Tensor:
     """T (source, time, band) of some sources: odds over their sum, never negative; of kicks, over that and what is at k = 0."""
-    index = torch.from_numpy(products(degrees).held).to(coefficients.device)
-    table = coefficients.new_zeros(index.shape).masked_scatter(index, coefficients)
-    exponent = torch.einsum(
-        "srp,pt->str", tones.shapes(numbers, degrees), table @ polynomials(clock_of(times), degrees[2]).T
-    )
-    moved = exponent.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).exp()
+    moved = power(tones.shapes(numbers, degrees), times, coefficients, terms(degrees).held)
     moved = torch.cat([tones.odds(kind, numbers, times) * moved[..., :-1], moved[..., -1:]], -1)
     moved = moved / moved.sum(-1, keepdim=True)
     own = torch.nn.functional.one_hot(tones.band(numbers), tones.n_bands).to(moved)
@@ -148,8 +138,10 @@ def shares(
     return found * (1 - tones.lost(numbers, times))[..., None] if kind == KINDS[1] else found
 
 
-class ToneRegression:
-    """A logistic regression for :func:`torchchain.master.compact.solve`: measured T of some tones and times.
+class ToneRegression(Regression):
+    """A logistic regression for :func:`torchchain.master.logistic.solve`: measured T of some tones and times.
+
+    Its odds are those of slots: the bands, and last the source's own tone.
 
     Args:
         tones, kind, degrees, numbers, times: see :func:`shares`.
@@ -158,53 +150,26 @@ class ToneRegression:
     """
 
     def __init__(
-        self,
-        tones: Tones,
-        kind: str,
-        degrees: tuple[int, int, int],
-        numbers: Tensor,
-        times: Tensor,
-        data: Tensor,
+        self, tones: Tones, kind: str, degrees: tuple[int, int, int], numbers: Tensor, times: Tensor, data: Tensor,
         weight: Tensor,
-    ) -> None:
-        odds = tones.odds(kind, numbers, times)
-        self.odds = torch.cat([odds, torch.ones_like(odds[..., :1])], -1).numpy()
-        self.shape = tones.shapes(numbers, degrees).numpy()
-        self.clock = polynomials(clock_of(times), degrees[2]).numpy()
-        self.held, self.data, self.weight = products(degrees).held, data.numpy(), weight.numpy()
-        self.own = np.arange(len(numbers)), tones.band(numbers).numpy()
-        size = len(products(degrees).heads)
-        self.equations = Equations(self.shape[:, :-1, :size], self.shape[:, -1, size:], self.clock, degrees)
+    ) -> None:  # fmt: skip
+        odds, shape = tones.odds(kind, numbers, times), tones.shapes(numbers, degrees)
+        odds = torch.cat([odds, torch.ones_like(odds[..., :1])], -1)
+        super().__init__(
+            odds.numpy(), shape.numpy(), polynomials(clock_of(times), degrees[2]).numpy(), degrees, data.numpy(), weight.numpy()
+        )  # fmt: skip
+        self._own = np.arange(len(numbers)), tones.band(numbers).numpy()
 
-    @property
-    def size(self) -> int:
-        """Coefficients."""
-        return int(self.held.sum())
+    @kept_property
+    def equations(self) -> Equations:
+        size = len(terms(self.degrees).heads)
+        return Equations(self.shape[:, :-1, :size], self.shape[:, -1, size:], self.clock, self.degrees)
 
-    def table(self, coefficients: np.ndarray) -> np.ndarray:
-        """Coefficients as a table, zeros where none is."""
-        table = np.zeros(self.held.shape)
-        table[self.held] = coefficients
-        return table
-
-    def misfit(self, table: np.ndarray) -> tuple[float, np.ndarray]:
-        """Weighted sum of squares with the ridge, and the share of every slot, (source, time, slot)."""
-        exponent = np.clip(self.shape @ (table @ self.clock.T), -LARGEST_EXPONENT, LARGEST_EXPONENT)
-        slots = self.odds * np.exp(exponent).transpose(0, 2, 1)
-        slots /= slots.sum(-1, keepdims=True)
-        missed = (self._bands(slots) - self.data) * self.weight[..., None]
-        return float((missed**2).sum() + RIDGE * (table**2).sum()), slots
-
-    def normal(self, slots: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix and right-hand side of the linearized problem, over the coefficients that are held."""
-        moved, bands = slots[..., :-1], self._bands(slots)
-        matrix = self.equations.matrix(moved, bands, self.weight)
-        matrix.flat[:: len(matrix) + 1] += RIDGE
-        pull = self.equations.pull(moved, bands, (self.data - bands) * self.weight[..., None] ** 2)
-        return matrix, pull - RIDGE * table[self.held]
+    def _moved(self, slots: np.ndarray) -> np.ndarray:
+        return slots[..., :-1]
 
     def _bands(self, slots: np.ndarray) -> np.ndarray:
         """The source's own tone added to its band, (source, time, band)."""
         bands = slots[..., :-1].copy()
-        bands[self.own[0], :, self.own[1]] += slots[..., -1]
+        bands[self._own[0], :, self._own[1]] += slots[..., -1]
         return bands

@@ -67,10 +67,17 @@ class Waves:
         return _of(scene.n_particles, scene.n_bands, tuple(scene.tones), strength)
 
     def tensors(self) -> dict[str, Tensor]:
-        return {
-            "source_frequency": self.source_frequency, "source_decay": self.source_decay,
-            "tone_frequency": self.tone_frequency, "tone_decay": self.tone_decay, "coupling": self.coupling,
-        }  # fmt: skip
+        return dict(vars(self))
+
+    @property
+    def distances(self) -> Tensor:
+        """Logarithms of those between frequencies in units of the decays, from 0 for the nearest bands to 1, [source, receiver]."""
+        n = len(self.source_frequency)
+        off = ~torch.eye(n, dtype=torch.bool, device=self.source_frequency.device)
+        far = (self.tone_frequency.mean(1) - self.source_frequency[:, None]).abs()
+        far = torch.asinh(far / (self.source_decay[:, None] + self.tone_decay.mean(1)))
+        low, high = (far[off].min(), far[off].max()) if n > 1 else (far.min(), far.max())
+        return ((far - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
 
 
 @functools.lru_cache(maxsize=16)
@@ -119,6 +126,13 @@ def first_odds(waves: Waves, times: Tensor, sources: Tensor) -> Tensor:
             _kept.pop(next(iter(_kept)), None)
         _kept[key] = _odds(waves, times, sources)
     return _kept[key]
+
+
+def all_odds(waves: Waves, times: Tensor, sources: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`first_odds` with 1 for the source's own band, and which band that is, 1 for it and else 0, [source, 1, receiver]."""
+    odds = first_odds(waves, times, sources)
+    own = torch.nn.functional.one_hot(sources, odds.shape[-1]).to(odds)[:, None]
+    return odds * (1 - own) + own, own
 
 
 def _odds(waves: Waves, times: Tensor, sources: Tensor) -> Tensor:
