@@ -61,11 +61,8 @@ class Exponentials:
         single = len(model.decay)
         amplitudes = model.amplitudes.detach().double().cpu().numpy().reshape(len(model.amplitudes), -1)
         pairs = amplitudes[single::2] - 1j * amplitudes[single + 1 :: 2]
-        poles = np.concatenate(
-            [-model.decay.double().cpu().numpy() + 0j,
-             -model.pair_decay.double().cpu().numpy() + 1j * model.pair_frequency.double().cpu().numpy()]
-        )  # fmt: skip
-        return cls(model.basis.double().cpu().numpy().ravel(), np.concatenate([amplitudes[:single] + 0j, pairs]), poles)
+        weight = np.concatenate([amplitudes[:single] + 0j, pairs])
+        return cls(model.basis.double().cpu().numpy().ravel(), weight, model.poles.exponents)
 
     @classmethod
     def of_embedding(cls, model: TransferModel) -> Exponentials:

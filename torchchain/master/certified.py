@@ -17,19 +17,21 @@ from torchchain.master.memory import ORDERS, MemoryModel, ProjectionReport
 from torchchain.master.model import TransferModel
 from torchchain.master.nonnegative import nonnegative
 from torchchain.master.proof import ROUNDING, Certificate
-from torchchain.master.records import Fitted, Progress, Recipe
+from torchchain.master.records import Progress, Recipe
 from torchchain.master.sample import Sample, decade_weights
 
 AS_GOOD = 1.05
 """Distance from the ensemble of a model that is never negative, relative to the free fit's, up to which it replaces it."""
 ORDERS_TRIED = 4
 """Orders whose decay rates are tried, downward from the chosen one: functions that hardly differ only make noise."""
+Projected = tuple[MemoryModel, ProjectionReport]
+"""A fit by the method "projection"."""
 DIVERGES = 0.1
 """A model whose energies leave [0, 1] by more than this share at any time is not handed out without a warning."""
 
 
 def certified(
-    transfer: BandTransfer, asked: Recipe, free: Fitted, mend: bool, progress: Progress = None, spare: bool = False
+    transfer: BandTransfer, asked: Recipe, free: Projected, mend: bool, progress: Progress = None, spare: bool = False
 ) -> tuple[TransferModel, ProjectionReport, Certificate | None]:
     """The model that is never negative, with its proof, in place of a free fit, where it is as near to the ensemble.
 
@@ -53,12 +55,26 @@ def certified(
         FitWarning: if the model that is left may be negative, or is farther from the ensemble because the free fit diverged.
     """
     model, told = free
+    noise = Sample.of(transfer).distance
     if asked.settings.certified and not mend:
-        return _of_order(transfer, free)
+        proof = certify(model)
+        if not proof.holds:
+            try:
+                model, proof = nonnegative(model, transfer.times, transfer.mean, noise)
+            except CertificateError as error:
+                raise checks.fail(
+                    "certified", f"be False for order {told.order} of these energies", str(error)
+                ) from None
+        return model, told, proof
     how = "certified=True makes one of that order that is never negative"
     far = _distance(model, transfer)
     nearest: tuple[float, TransferModel, ProjectionReport, Certificate] | None = None
-    for other, report, proof in _found(transfer, asked, free) if mend else ():
+    tried = _fits(transfer, asked, free) if mend and transfer.n_bands > 1 else ()  # one band keeps all its energy
+    for each, report in tried:
+        try:
+            other, proof = nonnegative(each, transfer.times, transfer.mean, noise)
+        except CertificateError:
+            continue
         off = _distance(other, transfer)
         if progress is not None:
             progress(1)
@@ -90,43 +106,15 @@ def certified(
     return (model, told, None) if nearest is None else nearest[1:]
 
 
-def _of_order(transfer: BandTransfer, free: Fitted) -> tuple[TransferModel, ProjectionReport, Certificate]:
-    """The model with the free fit's decay rates that is never negative."""
-    model, told = free
-    assert isinstance(model, MemoryModel), "of the method 'projection'"
-    proof = certify(model)
-    if proof.holds:
-        return model, told, proof
-    try:
-        found, proof = nonnegative(model, transfer.times, transfer.mean, Sample.of(transfer).distance)
-    except CertificateError as error:
-        raise checks.fail("certified", f"be False for order {told.order} of these energies", str(error)) from None
-    return found, told, proof
-
-
-def _found(
-    transfer: BandTransfer, asked: Recipe, free: Fitted
-) -> Iterator[tuple[TransferModel, ProjectionReport, Certificate]]:
-    """Models that are never negative, with the decay rates of the free fit and of fits of smaller orders, and the proof."""
-    noise = Sample.of(transfer).distance
-    if transfer.n_bands == 1:  # it keeps all its energy: nothing decays that could be mended
-        return
-    for model, told in _fits(transfer, asked, free):
-        assert isinstance(model, MemoryModel), "of the method 'projection'"
-        try:
-            found, proof = nonnegative(model, transfer.times, transfer.mean, noise)
-        except CertificateError:
-            continue
-        yield found, told, proof
-
-
-def _fits(transfer: BandTransfer, asked: Recipe, free: Fitted) -> Iterator[Fitted]:
+def _fits(transfer: BandTransfer, asked: Recipe, free: Projected) -> Iterator[Projected]:
     """The free fit, and those of the next smaller orders."""
     yield free
     at = ORDERS.index((asked.order[0], asked.order[1]))
     sample = Sample.of(transfer)
     for order in ORDERS[max(at - ORDERS_TRIED + 1, 0) : at][::-1]:
-        yield replace(asked, settings=replace(asked.settings, order=order)).run(sample)
+        model, told = replace(asked, settings=replace(asked.settings, order=order)).run(sample)
+        assert isinstance(model, MemoryModel), "of the method 'projection'"
+        yield model, told
 
 
 def _distance(model: TransferModel, transfer: BandTransfer) -> float:

@@ -7,7 +7,7 @@ Phys. 134, 174105, 2011). The energy of a disordered chain passes neither test: 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -90,7 +90,7 @@ def chapman_kolmogorov(
         return mean[:, places], predicted
 
     measured, predicted = both(transfer.mean)
-    differences = torch.stack([a - b for a, b in map(both, _without_one(transfer))])
+    differences = torch.stack([a - b for a, b in map(both, without_one(transfer))])
     return ChapmanKolmogorov(lag, transfer.times[places], measured, predicted, jackknife_error(differences))
 
 
@@ -121,7 +121,7 @@ def implied_timescales(transfer: BandTransfer, lags: Any) -> tuple[Tensor, Tenso
         return torch.where(size < 1, -lags[:, None] / size.clamp(max=1 - 1e-16).log(), torch.inf)
 
     value = scales(transfer.mean)
-    rates = torch.stack([1 / scales(mean) for mean in _without_one(transfer)])  # finite where scales are not
+    rates = torch.stack([1 / scales(mean) for mean in without_one(transfer)])  # finite where scales are not
     return value, value.square().nan_to_num(posinf=torch.inf) * jackknife_error(rates)
 
 
@@ -132,10 +132,11 @@ def _at(name: str, transfer: BandTransfer, time: float) -> int:
     return place
 
 
-def _without_one(transfer: BandTransfer) -> list[Tensor]:
+def without_one(transfer: BandTransfer) -> Iterator[Tensor]:
     """The mean transfer without each block of realizations in turn."""
     counts = torch.tensor(transfer.block_counts, dtype=transfer.mean.dtype)
     if len(counts) < 2:
         raise checks.fail("transfer", "have at least 2 blocks of realizations", len(counts))
     whole = torch.einsum("b,bstr->str", counts, transfer.block_mean)
-    return [(whole - n * part) / (counts.sum() - n) for n, part in zip(counts, transfer.block_mean, strict=True)]
+    for n, part in zip(counts, transfer.block_mean, strict=True):
+        yield (whole - n * part) / (counts.sum() - n)

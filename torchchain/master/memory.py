@@ -109,6 +109,12 @@ class MemoryModel(TransferModel):
         return kept + self.amplitudes[1:].numel() + len(self.decay) + 2 * len(self.pair_decay)
 
     @property
+    def poles(self) -> Poles:
+        """Decay rates and frequencies, in double precision."""
+        every = (self.decay, self.pair_decay, self.pair_frequency)
+        return Poles(*(value.detach().double().cpu().numpy() for value in every))
+
+    @property
     def order(self) -> Order:
         """Numbers of exponentials and of pairs."""
         return len(self.decay), len(self.pair_decay)
@@ -232,14 +238,10 @@ def fit_memory(
     at_zero = (torch.eye(len(basis), dtype=basis.dtype) - basis).flatten().numpy()
     leading = leading_vectors(data) if leading is None else leading
     small = Projection(times.numpy(), data @ leading, at_zero @ leading)
-    poles, ended = search(small, order, None if near is None else _poles(near), progress)
+    poles, ended = search(small, order, None if near is None else near.poles, progress)
     amplitudes, misfit, _ = Projection(times.numpy(), data, at_zero).amplitudes(poles)
     report = ProjectionReport(ended, float(np.sqrt(np.mean(misfit**2))), order)
-    return _tensors(basis, poles, amplitudes, _conserved(mean, basis)), report
-
-
-def _poles(model: MemoryModel) -> Poles:
-    return Poles(model.decay.numpy(), model.pair_decay.numpy(), model.pair_frequency.numpy())
+    return packed(basis, poles, amplitudes, _conserved(mean, basis)), report
 
 
 def _conserved(mean: Tensor, basis: Tensor) -> bool:
@@ -247,15 +249,13 @@ def _conserved(mean: Tensor, basis: Tensor) -> bool:
     return float((mean.sum(-1) - basis.sum(-1)[:, None]).abs().max()) < 1e-9
 
 
-def _tensors(basis: Tensor, poles: Poles, amplitudes: np.ndarray, conserved: bool) -> dict[str, Tensor]:
+def packed(basis: Tensor, poles: Poles, amplitudes: np.ndarray, conserved: bool = False) -> dict[str, Tensor]:
+    """Those tensors of a model that a fit finds; rows of amplitudes sum to zero where energy is conserved."""
     amplitudes = amplitudes.reshape(-1, *basis.shape)
     if conserved:
         amplitudes = amplitudes - amplitudes.mean(-1, keepdims=True)
-    found = {"decay": poles.decay, "pair_decay": poles.pair_decay, "pair_frequency": poles.pair_frequency}
-    return {
-        "basis": basis, "amplitudes": torch.from_numpy(amplitudes),
-        **{name: torch.from_numpy(value.copy()) for name, value in found.items()},
-    }  # fmt: skip
+    found = {name: torch.from_numpy(value.copy()) for name, value in vars(poles).items()}
+    return {"basis": basis, "amplitudes": torch.from_numpy(amplitudes), **found}
 
 
 def _stays(sample: Sample) -> Tensor:
@@ -284,7 +284,7 @@ def replicas(transfer: BandTransfer, recipe: Recipe, model: MemoryModel, repeats
     block is reduced once, and each replica is fitted to a sum of rows.
     """
     sample, n = Sample.of(transfer), transfer.n_bands
-    poles = _poles(model)
+    poles = model.poles
     times = sample.times.numpy()
     wanted = np.concatenate([poles.functions(times), poles.slopes(times), np.ones((len(times), 1))], axis=1)
     rows, _ = np.linalg.qr(wanted / np.linalg.norm(wanted, axis=0))
@@ -304,7 +304,7 @@ def replicas(transfer: BandTransfer, recipe: Recipe, model: MemoryModel, repeats
         with single_blas_thread():
             moved, _, _ = small.polished(poles, REFIT_STEPS)
             amplitudes, _, _ = Projection(times, data, eye - stays, rows.T).amplitudes(moved)
-        yield MemoryModel(rates=values[:, -1].clone(), **_tensors(kept, moved, amplitudes, conserved))
+        yield MemoryModel(rates=values[:, -1].clone(), **packed(kept, moved, amplitudes, conserved))
 
 
 REFIT_STEPS = 8

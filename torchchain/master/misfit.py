@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchchain import checks
+from torchchain.master.model import shaped
 
 TIMES, BANDS = 2, 2
 """Neighbors on either side over which the model's error is averaged."""
@@ -28,20 +28,15 @@ def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, noise: Tensor) 
             has followed that noise.
     """
     for name, value in (("mean", mean), ("stderr", stderr), ("noise", noise)):
-        if value.shape != predicted.shape:
-            raise checks.fail(name, f"have shape {tuple(predicted.shape)}", f"shape {tuple(value.shape)}")
+        shaped(name, value, tuple(predicted.shape))
     variance = stderr.square()
     told = variance > ROUNDING**2
     unit = torch.where(told, variance, torch.ones_like(variance))
     excess = ((predicted - mean).square() - noise.square()) / unit
     own = torch.eye(len(mean), dtype=torch.bool, device=mean.device)[:, None].expand_as(mean)
+    others, size, edge = (~own).to(excess), (2 * TIMES + 1, 2 * BANDS + 1), (TIMES, BANDS)
     table = excess.diagonal(dim1=0, dim2=2)[None]  # [1, time, source]
-    kept = functional.avg_pool2d(
-        table[:, None], (2 * TIMES + 1, 2 * BANDS + 1), 1, (TIMES, BANDS), count_include_pad=False
-    )[0, 0].T
-    others = (~own).to(excess)
-    size, edge = (2 * TIMES + 1, 2 * BANDS + 1), (TIMES, BANDS)
-    total = functional.avg_pool2d((excess * others)[:, None], size, 1, edge)[:, 0]
-    count = functional.avg_pool2d(others[:, None], size, 1, edge)[:, 0]
+    kept = functional.avg_pool2d(table, size, 1, edge, count_include_pad=False)[0].T
+    total, count = (functional.avg_pool2d(x, size, 1, edge) for x in (excess * others, others))
     smooth = torch.where(own, kept[:, :, None], total / count.clamp(min=1e-12))
     return (smooth.clamp(min=0) * unit).sqrt() * told

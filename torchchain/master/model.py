@@ -50,6 +50,7 @@ class TransferModel(nn.Module):
         optional: those of them that a file may lack.
         rates_meaning: what :attr:`rates` are, in words.
         has_equation: whether its energies are those of :meth:`embedding`, which else is the nearest linear equation to them.
+        predicts: observables of a scene that it can stand in for.
 
     Example:
         >>> class Settling(tc.TransferModel):  # a model of your own: every band relaxes to its share in Pi at one rate
@@ -69,6 +70,7 @@ class TransferModel(nn.Module):
     kind: ClassVar[str]
     axes: ClassVar[dict[str, tuple[str, ...]]]
     optional: ClassVar[tuple[str, ...]] = ()
+    predicts: ClassVar[frozenset[str]] = frozenset({"band_energy", "long_time_band_energy"})
     rates_meaning: ClassVar[str] = "slope of the model's transfer at time 0"
     has_equation: ClassVar[bool] = True
     basis: Tensor

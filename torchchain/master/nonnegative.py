@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.master.certificate import CertificateError, Exponentials, certify, proof_edges
-from torchchain.master.memory import MemoryModel
+from torchchain.master.memory import MemoryModel, packed
+from torchchain.master.projection import Poles
 from torchchain.master.proof import Certificate
 
 ONSET = 4
@@ -44,44 +45,37 @@ class Space:
     """The functions of time that a fit combines: those of fixed poles that vanish at t = 0 with ONSET - 1 derivatives.
 
     Attributes:
-        decay, pair_decay, pair_frequency: the poles, (exponential,), (pair,), (pair,).
+        poles: theirs.
         start: coefficients of one function that is 1 at t = 0 and has no slope there, (function,).
         free: coefficients of functions orthonormal over the times of the fit, (function, direction).
     """
 
-    decay: np.ndarray
-    pair_decay: np.ndarray
-    pair_frequency: np.ndarray
+    poles: Poles
     start: np.ndarray
     free: np.ndarray
 
     @classmethod
-    def of(
-        cls, decay: np.ndarray, pair_decay: np.ndarray, pair_frequency: np.ndarray, times: np.ndarray,
-        weight: np.ndarray, cut: float,
-    ) -> Space:  # fmt: skip
+    def of(cls, poles: Poles, times: np.ndarray, weight: np.ndarray, cut: float) -> Space:
         """Directions whose weighted functions are below ``cut`` of the largest are left out."""
-        bare = cls(decay, pair_decay, pair_frequency, np.zeros(0), np.zeros(0))
-        onset = np.concatenate([bare.functions(np.zeros(1), k) for k in range(ONSET)])
+        zero = np.zeros(1)
+        onset = np.concatenate([_functions(poles, zero, k) for k in range(ONSET)])
         onset /= np.linalg.norm(onset, axis=1, keepdims=True)
         first = np.zeros(ONSET)
-        first[0] = 1 / np.linalg.norm(bare.functions(np.zeros(1)))
+        first[0] = 1 / np.linalg.norm(_functions(poles, zero))
         start = np.linalg.pinv(onset) @ first
         vanishing = np.linalg.svd(onset)[2][ONSET:].T
-        functions = bare.functions(times) * weight[:, None]
+        functions = _functions(poles, times) * weight[:, None]
         _, scale, right = np.linalg.svd(functions @ vanishing, full_matrices=False)
         held = scale > cut * scale[0]
-        return cls(decay, pair_decay, pair_frequency, start, vanishing @ (right[held].T / scale[held]))
+        return cls(poles, start, vanishing @ (right[held].T / scale[held]))
 
-    def functions(self, times: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """f_m or one of its derivatives, (time, function)."""
-        poles = np.concatenate([-self.decay + 0j, -self.pair_decay + 1j * self.pair_frequency])
-        values = np.exp(times[:, None] * poles) * poles**derivative
-        single = len(self.decay)
-        pairs = values[:, single:]
-        return np.concatenate(
-            [values[:, :single].real, np.stack([pairs.real, pairs.imag], axis=-1).reshape(len(times), -1)], axis=1
-        )
+
+def _functions(poles: Poles, times: np.ndarray, derivative: int = 0) -> np.ndarray:
+    """f_m or one of its derivatives, (time, function)."""
+    values, single = np.exp(times[:, None] * poles.exponents) * poles.exponents**derivative, len(poles.decay)
+    pairs = values[:, single:]
+    pairs = np.stack([pairs.real, pairs.imag], axis=-1).reshape(len(times), -1)
+    return np.concatenate([values[:, :single].real, pairs], axis=1)
 
 
 def nonnegative(
@@ -124,24 +118,17 @@ def nonnegative(
     grid, weight = np.concatenate([times.numpy(), beyond]), np.concatenate([weight, np.full(16, LATER * weight[-1])])
     rest = torch.cat([mean - basis[:, None], torch.zeros(len(basis), 16, len(basis), dtype=basis.dtype)], dim=1).numpy()
     slowest = SLOWEST / float(times[-1])
-    poles = (
-        np.concatenate([np.maximum(model.decay.numpy(), slowest), EARLY_DECAY]),
-        np.concatenate([np.maximum(model.pair_decay.numpy(), slowest), [g for g, _ in EARLY_PAIRS]]),
-        np.concatenate([model.pair_frequency.numpy(), [w for _, w in EARLY_PAIRS]]),
+    poles, early = model.poles, np.array(EARLY_PAIRS)
+    poles = Poles(
+        np.concatenate([np.maximum(poles.decay, slowest), EARLY_DECAY]),
+        np.concatenate([np.maximum(poles.pair_decay, slowest), early[:, 0]]),
+        np.concatenate([poles.pair_frequency, early[:, 1]]),
     )
 
     def built(amplitudes: np.ndarray) -> MemoryModel:
-        return MemoryModel(
-            model.rates,
-            basis,
-            torch.from_numpy(amplitudes),
-            torch.from_numpy(poles[0]),
-            torch.from_numpy(poles[1]),
-            torch.from_numpy(poles[2]),
-            model.damping,
-        )
+        return MemoryModel(rates=model.rates, damping=model.damping, **packed(basis, poles, amplitudes))
 
-    weighted = Space(*poles, np.zeros(0), np.zeros(0)).functions(grid) * weight[:, None]
+    weighted = _functions(poles, grid) * weight[:, None]
     wanted = rest.transpose(1, 0, 2).reshape(len(grid), -1) * weight[:, None]
 
     def misfit(amplitudes: np.ndarray) -> float:
@@ -150,7 +137,7 @@ def nonnegative(
     failed: tuple[MemoryModel, Certificate] | None = None
     best: tuple[float, MemoryModel, Certificate] | None = None
     for cut in CUTS:
-        space = Space.of(*poles, grid, weight, cut)
+        space = Space.of(poles, grid, weight, cut)
         free = _least_squares(space, grid, weight, rest, (eye - basis).numpy())
         if float(np.abs(free).sum(0).max()) > LARGEST_AMPLITUDES:
             continue
@@ -182,7 +169,7 @@ def _least_squares(
     space: Space, times: np.ndarray, weight: np.ndarray, data: np.ndarray, at_zero: np.ndarray
 ) -> np.ndarray:
     """Amplitudes [function, source, receiver] nearest to the data [source, time, receiver]."""
-    functions = space.functions(times)
+    functions = _functions(space.poles, times)
     rest = data.transpose(1, 0, 2).reshape(len(times), -1) - np.outer(functions @ space.start, at_zero.ravel())
     best = np.linalg.lstsq(functions @ space.free * weight[:, None], rest * weight[:, None], rcond=None)[0]
     return (np.outer(space.start, at_zero.ravel()) + space.free @ best).reshape(-1, *at_zero.shape)
@@ -205,7 +192,7 @@ def _lifted(space: Space, amplitudes: np.ndarray, basis: np.ndarray, grid: np.nd
 
     Every pair of different bands is a problem of its own: what it gains, the source's own band loses.
     """
-    directions = np.concatenate([space.functions(grid), space.functions(np.zeros(1), ONSET)])
+    directions = np.concatenate([_functions(space.poles, grid), _functions(space.poles, np.zeros(1), ONSET)])
     level = np.concatenate([np.ones(len(grid)), [0.0]])
     result = amplitudes.copy()
     for source in range(len(basis)):

@@ -11,6 +11,7 @@ import torch
 from torchchain import checks
 from torchchain.ensemble.statistics import jackknife_error
 from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.diagnostics import without_one
 from torchchain.master.fits import checked_window, linear_weights
 from torchchain.master.sample import Sample, paper_basis
 
@@ -60,11 +61,9 @@ def paper_rates(
         return weights[used] @ energy / free
 
     rates = slopes(transfer.mean[:, used])
-    counts = torch.tensor(transfer.block_counts, dtype=rates.dtype)
     stderr = torch.full_like(rates, torch.inf)
-    if len(counts) > 1:
-        parts = counts[:, None, None, None] * transfer.block_mean[:, :, used]
-        stderr = jackknife_error(slopes((parts.sum(0) - parts) / (counts.sum() - counts)[:, None, None, None]))
+    if len(transfer.block_counts) > 1:
+        stderr = jackknife_error(torch.stack([slopes(mean[:, used]) for mean in without_one(transfer)]))
     bands = np.arange(1, transfer.n_bands + 1)
     unit = {"units": "1 / travel time of sound over one particle"}
     import xarray

@@ -37,11 +37,20 @@ class Poles:
         return len(self.decay), len(self.pair_decay)
 
     @property
+    def exponents(self) -> np.ndarray:
+        """-g of the exponentials and -g + i w of the pairs, complex."""
+        return np.concatenate([-self.decay + 0j, -self.pair_decay + 1j * self.pair_frequency])
+
+    @property
+    def least(self) -> np.ndarray:
+        """Lower bounds of the search, (parameter,)."""
+        return np.concatenate([np.full(sum(self.order), SLOWEST), np.full(self.order[1], SLOWEST_TURN)])
+
+    @property
     def logarithms(self) -> np.ndarray:
         """What is searched, within its bounds."""
-        low = np.concatenate([np.full(sum(self.order), SLOWEST), np.full(self.order[1], SLOWEST_TURN)])
         every = np.concatenate([self.decay, self.pair_decay, self.pair_frequency])
-        return np.log(np.clip(every, low * 1.01, FASTEST / 1.01))
+        return np.log(np.clip(every, self.least * 1.01, FASTEST / 1.01))
 
     @classmethod
     def of(cls, logarithms: np.ndarray, order: Order) -> Poles:
@@ -109,10 +118,9 @@ class Projection:
     def polished(self, poles: Poles, steps: int) -> tuple[Poles, float, bool]:
         """The poles of the least misfit nearby, half its square, and whether the search ended by itself."""
         order = poles.order
-        low = np.log(np.concatenate([np.full(sum(order), SLOWEST), np.full(order[1], SLOWEST_TURN)]))
         found = scipy.optimize.least_squares(
             lambda p: self.amplitudes(Poles.of(p, order))[1].ravel(), poles.logarithms,
-            jac=lambda p: self.jacobian(Poles.of(p, order)), bounds=(low, np.log(FASTEST)),
+            jac=lambda p: self.jacobian(Poles.of(p, order)), bounds=(np.log(poles.least), np.log(FASTEST)),
             ftol=1e-6, xtol=1e-6, gtol=1e-12, max_nfev=steps,
         )  # fmt: skip
         return Poles.of(found.x, order), float(found.cost), bool(found.success)

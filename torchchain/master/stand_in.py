@@ -16,17 +16,15 @@ from torchchain.energy.start_energy import StartEnergy, excited
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.plan import ARTIFACT, Choice, Plan, statistical_error
 from torchchain.ensemble.scene import Scene
-from torchchain.master.derived import covered
+from torchchain.master.derived import THEORY, covered
 from torchchain.master.equation import MasterEquation
 from torchchain.theory.transfer import predicted_error
-
-PREDICTED = frozenset({"band_energy", "long_time_band_energy"})
 
 
 def missing(master: MasterEquation, scene: Scene) -> list[str]:
     """What the scene asks for beyond the calibration, in words; empty where the calibration covers it."""
     found = master.concerns(scene)
-    other = [name for name in scene.observables if name not in PREDICTED]
+    other = [name for name in scene.observables if name not in master.model.predicts]
     if other:
         found.append(f"{', '.join(other)}, where it predicts energies of bands")
     return found
@@ -102,7 +100,11 @@ def _theory(scene: Scene, tolerance: float) -> tuple[list[Choice], list[str]]:
 
     Where no tolerance is asked for, it is told of if it is nearer to an endless ensemble than the scene's is, but not chosen.
     """
-    if not set(scene.observables) <= PREDICTED or not isinstance(scene.excitation, StandingWave) or scene.is_ordered:
+    if (
+        not THEORY.kind.predicts.issuperset(scene.observables)
+        or not isinstance(scene.excitation, StandingWave)
+        or scene.is_ordered
+    ):
         return [], []
     try:
         law, waves = covered(scene)
