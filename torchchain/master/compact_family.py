@@ -247,8 +247,7 @@ class Together:
             )
             for sample, slopes, row, guide in zip(self._samples, rates, rows, self._guides, strict=True)
         ]  # fmt: skip
-        sets = self._mixing.shape[1]
-        return models, CompactReport(told["converged"], told["steps"], told["misfit"], self._degrees, sets)
+        return models, CompactReport(**told, degrees=self._degrees, sets=self._mixing.shape[1])
 
     def _start(self) -> np.ndarray:
         """The common coefficients nearest to those of every regression alone, in units of their errors, (set, coefficient)."""

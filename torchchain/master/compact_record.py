@@ -90,7 +90,7 @@ def _fit(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: P
             sample.distance, _left(sample), near if isinstance(near, CompactModel) else None, progress,
         )  # fmt: skip
     model = CompactModel(**model.tensors() | loss_tensors(sample))
-    return model, CompactReport(told["converged"], told["steps"], told["misfit"], model.degrees_)
+    return model, CompactReport(**told, degrees=model.degrees_)
 
 
 def drawn_again(transfer: BandTransfer, repeats: Tensor) -> Tensor:

@@ -285,7 +285,7 @@ def _correct(sample: Sample, recipe: Recipe, near: TransferModel | None, progres
     with single_blas_thread():
         found, told = solve([problem], np.ones((1, 1)), first.double().cpu().numpy()[None], progress)
     tensors = model.tensors() | {"coefficients": torch.from_numpy(found[0])}
-    return TheoryModel(**tensors), CompactReport(told["converged"], told["steps"], told["misfit"], degrees)
+    return TheoryModel(**tensors), CompactReport(**told, degrees=degrees)
 
 
 def _same(transfer: BandTransfer, recipe: Recipe, model: TheoryModel, repeats: Tensor) -> Iterator[TheoryModel]:

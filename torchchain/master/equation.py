@@ -34,10 +34,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 NEGATIVE_SHARE = 1e-3
-OF_CHAINS_TOO = "energies by site are no squares, and chains on their way to rest have such energies as well"
 """Negative energies of a band up to this share of the total are not worth a warning."""
 GAINED_SHARE = 1e-2
 """Nor is energy that a model makes, up to this share of the total."""
+WITHOUT_STARTS = "the model was calibrated without other starts: energies of bands are taken as those of its own tones, released at rest"
+OF_CHAINS_TOO = "energies by site are no squares, and chains on their way to rest have such energies as well"
 
 
 class PredictionWarning(UserWarning):
@@ -200,29 +201,26 @@ class MasterEquation(Printed, nn.Module):
                 raise checks.fail("supply", "be None for a start in space", checks.shown(supply))
             with single_thread():
                 energy = self.starts.solve(start, times).to(self.rates)
-            self._warn(start.bands(self.n_bands).to(self.rates), times, None, energy.detach(), OF_CHAINS_TOO)
-            return energy
-        if start is not None:
-            warnings.warn(
-                "the model was calibrated without other starts: energies of bands are taken as those of its own tones, released at rest",
-                PredictionWarning,
-                stacklevel=2,
-            )
-        initial = self._initial(initial if start is None else start.bands(self.n_bands))
-        fed = None if supply is None else self._supply(supply, initial, times)
-        with single_thread():
-            energy = solver.run(self.model, initial, times, fed, **options)
-        if not bool(energy.isfinite().all()):
-            raise IntegrationError(f"solver '{method}' must stay finite, got overflow up to time {float(times[-1]):g}")
-        if energy.numel() and not self.model.has_equation and (fed is not None or method != "expm"):
-            off = "" if fed is not None else f", up to {self._off(initial, times, energy):.1e} of the energy away at these times"
-            warnings.warn(
-                f"the model '{self.model.kind}' obeys no differential equation: {'supply' if off == '' else repr(method)} takes "
-                f"the nearest model with memory{off}",
-                PredictionWarning,
-                stacklevel=2,
-            )
-        self._warn(initial, times, fed, energy.detach())
+            doubts = self._doubts(start.bands(self.n_bands).to(self.rates), times, None, energy.detach(), OF_CHAINS_TOO)
+        else:
+            of_bands = self._initial(initial if start is None else start.bands(self.n_bands))
+            fed = None if supply is None else self._supply(supply, of_bands, times)
+            with single_thread():
+                energy = solver.run(self.model, of_bands, times, fed, **options)
+            if not bool(energy.isfinite().all()):
+                raise IntegrationError(
+                    f"solver '{method}' must stay finite, got overflow up to time {float(times[-1]):g}"
+                )
+            doubts = [] if start is None else [WITHOUT_STARTS]
+            if energy.numel() and not self.model.has_equation and (fed is not None or method != "expm"):
+                words = "supply takes the nearest model with memory"
+                if fed is None:
+                    off = f"{self._off(of_bands, times, energy):.1e} of the energy away at these times"
+                    words = f"{method!r} takes the nearest model with memory, up to {off}"
+                doubts.append(f"the model '{self.model.kind}' obeys no differential equation: {words}")
+            doubts += self._doubts(of_bands, times, fed, energy.detach())
+        for words in doubts:
+            warnings.warn(words, PredictionWarning, stacklevel=2)
         return energy
 
     def transfer(self, times: Any) -> Tensor:
@@ -266,20 +264,18 @@ class MasterEquation(Printed, nn.Module):
             raise checks.fail("supply", f"fit a batch of {tuple(initial.shape[:-1])} starts", f"shape {tuple(supply.shape)}") from None  # fmt: skip
         return supply.expand(*batch, *shape)
 
-    def _warn(
+    def _doubts(
         self, initial: Tensor, times: Tensor, fed: Tensor | None, energy: Tensor,
         why_negative: str = "the model is that uncertain there",
-    ) -> None:  # fmt: skip
-        """The warnings of :meth:`solve`, shown at the line that called it."""
-        end = float(times[-1])
+    ) -> list[str]:  # fmt: skip
+        """What to warn of in a prediction."""
+        end, found = float(times[-1]), []
         if end > self.horizon * (1 + 1e-9):
-            warnings.warn(
-                f"prediction to time {end:g} lies beyond {self.horizon:g}, up to which this model was compared with chains",
-                PredictionWarning,
-                stacklevel=3,
+            found.append(
+                f"prediction to time {end:g} lies beyond {self.horizon:g}, up to which this model was compared with chains"
             )
         if not energy.numel() or bool((initial < 0).any()) or (fed is not None and bool((fed < 0).any())):
-            return
+            return found
         total = initial.sum(-1)[..., None]
         if fed is not None:
             steps = torch.diff(times, prepend=times.new_zeros(1))
@@ -288,19 +284,14 @@ class MasterEquation(Printed, nn.Module):
         gained = energy.sum(-1) / total - 1
         if float(gained.max()) > GAINED_SHARE:
             when = float(times[int(gained.reshape(-1, len(times)).amax(0).argmax())])
-            warnings.warn(
+            found.append(
                 f"predicted energy has grown by {float(gained.max()):.2g} of the total at time {when:g}: rows of the rates "
-                f"that do not sum to zero make energy (conservation_defect {self.conservation_defect:.2g})",
-                PredictionWarning,
-                stacklevel=3,
+                f"that do not sum to zero make energy (conservation_defect {self.conservation_defect:.2g})"
             )
         lowest = float((energy.amin(-1) / total).min())
         if lowest < -NEGATIVE_SHARE:
-            warnings.warn(
-                f"lowest predicted energy of a band is {lowest:.2g} of the total: {why_negative}",
-                PredictionWarning,
-                stacklevel=3,
-            )
+            found.append(f"lowest predicted energy of a band is {lowest:.2g} of the total: {why_negative}")
+        return found
 
     def standard_error(self, initial: Any, times: Any) -> Tensor:
         """Standard error of :meth:`solve`, (*batch, time, band), by bootstrap and with the model's own misfit.

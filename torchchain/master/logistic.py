@@ -338,4 +338,4 @@ def fit_compact(
         rates=rates, degrees=torch.tensor(degrees, dtype=torch.float64), coefficients=torch.from_numpy(found[0]),
         **waves.tensors(),
     )  # fmt: skip
-    return model, report | {"degrees": list(degrees)}
+    return model, report

@@ -13,7 +13,8 @@ of T' is exact: a moment after the kick v0 the state is (v0 dt, v0).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,9 +30,10 @@ from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.alike import variance
 from torchchain.master.logistic import BEYOND, chosen_times, solve
 from torchchain.master.misfit import model_error
+from torchchain.master.model import shaped
 from torchchain.master.polynomials import checked_degrees, n_coefficients
 from torchchain.master.tones import ONSET, ToneRegression, Tones, shares
-from torchchain.master.uncertainty import Uncertainty
+from torchchain.master.uncertainty import Uncertainty, interpolated
 from torchchain.threads import single_blas_thread
 
 DEGREES = (12, 8, 16)
@@ -83,6 +85,12 @@ class StartModel(nn.Module):
     }  # fmt: skip
     SHARES: ClassVar[tuple[str, ...]] = ("rigid", "onset")
     OPTIONAL: ClassVar[tuple[str, ...]] = (*SHARES, "stderr")
+    released: Tensor
+    kicked: Tensor
+    frequency: Tensor
+    scale_times: Tensor
+    scale: Tensor
+    stderr: Tensor
 
     def __init__(
         self, degrees: Tensor, released: Tensor, kicked: Tensor, frequency: Tensor, decay: Tensor, coupling: Tensor,
@@ -101,19 +109,12 @@ class StartModel(nn.Module):
             "stderr": (coupling.new_zeros(2, n_bands, 0, n_bands) if stderr is None else stderr, (2, n_bands, 0 if stderr is None else len(scale_times), n_bands)),
         }  # fmt: skip
         for name, (value, shape) in shapes.items():
-            value = checks.real_tensor(f"starts.{name}", value).double()
-            if tuple(value.shape) != shape:
-                raise checks.fail(f"starts.{name}", f"have shape {shape}", f"shape {tuple(value.shape)}")
+            value = shaped(f"starts.{name}", value, shape).double()
             if name in ("frequency", "decay", "coupling"):
                 checks.first_bad(f"starts.{name}", "be positive", value, ~(value > 0), "tone")
             if name in self.SHARES and not (float(value) >= 0 and (name == "onset" or float(value) <= 0.25)):
                 raise checks.fail(f"starts.{name}", "be a share of the energy", float(value))
             self.register_buffer(name, value.detach().clone())
-        self.released: Tensor
-        self.kicked: Tensor
-        self.scale_times: Tensor
-        self.scale: Tensor
-        self.stderr: Tensor
         if not count or count % n_bands:
             raise checks.fail("starts.frequency", f"hold tones of {n_bands} bands alike", count)
         if not bool((self.stderr >= 0).all()):
@@ -129,9 +130,8 @@ class StartModel(nn.Module):
 
     def tensors(self) -> dict[str, Tensor]:
         """All that makes the model but ``n_bands``, as its constructor takes it."""
-        degrees = self.released.new_tensor(self.degrees)
-        every = {name: getattr(self, name) for name in self.AXES if name != "degrees"}
-        return {"degrees": degrees, **every, "stderr": self.stderr.float()}
+        every = {name: getattr(self, name) for name in self.AXES}
+        return every | {"degrees": self.released.new_tensor(self.degrees), "stderr": self.stderr.float()}
 
     @property
     def n_parameters(self) -> int:
@@ -141,14 +141,12 @@ class StartModel(nn.Module):
     @property
     def n_particles(self) -> int:
         """N, of the rings."""
-        return 2 * len(self.get_buffer("frequency"))
+        return 2 * len(self.frequency)
 
     @property
     def _tones(self) -> Tones:
-        return Tones(
-            **{name: self.get_buffer(name) for name in ("frequency", "decay", "coupling", *self.SHARES)},
-            n_bands=self.n_bands,
-        )
+        names = ("frequency", "decay", "coupling", *self.SHARES)
+        return Tones(**{name: self.get_buffer(name) for name in names}, n_bands=self.n_bands)
 
     def transfer(self, kind: str, tones: Any, times: Tensor) -> Tensor:
         """T [tone, time, receiver] of some tones, counted from 1.
@@ -164,7 +162,7 @@ class StartModel(nn.Module):
 
     def _shares(self, kind: str, numbers: Tensor, times: Tensor) -> Tensor:
         coefficients = self.released if kind == KINDS[0] else self.kicked
-        window = max(1, TOGETHER // (len(numbers) * len(self.get_buffer("frequency"))))
+        window = max(1, TOGETHER // (len(numbers) * len(self.frequency)))
         parts = [shares(self._tones, kind, self.degrees, coefficients, numbers, part) for part in times.split(window)]
         return torch.cat(parts, 1)
 
@@ -182,11 +180,9 @@ class StartModel(nn.Module):
         self.check(start)
         times = times.to(self.released)
         every = torch.arange(start.kinetic.shape[-1], device=times.device)
-        step = STEP * (1 + times).clamp(max=10.0)
-        before = (times - step).clamp(min=0)
-        slope = (self._tones.lost(every, times + step) - self._tones.lost(every, before)) / (times + step - before)
+        change, length = _change(partial(self._tones.lost, every), times)
         gone = start.kinetic.to(times) @ self._tones.lost(every, times)
-        return gone + start.virial.to(times) @ slope
+        return gone + start.virial.to(times) @ (change / length)
 
     def _parts(self, start: StartEnergy, times: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Energies of tones that start with some, and what becomes of a unit of each."""
@@ -194,10 +190,8 @@ class StartModel(nn.Module):
             values = getattr(start, name).to(self.released)
             used = (values.reshape(-1, values.shape[-1]) != 0).any(0).nonzero()[:, 0]
             if len(used) and name == "virial":
-                step = STEP * (1 + times).clamp(max=10.0)
-                before = (times - step).clamp(min=0)
-                ahead, behind = (self._shares(KINDS[1], used, when) for when in (times + step, before))
-                yield values[..., used], (ahead - behind) / (times + step - before)[:, None]
+                change, length = _change(partial(self._shares, KINDS[1], used), times)
+                yield values[..., used], change / length[:, None]
             elif len(used):
                 yield values[..., used], self._shares(KINDS[name == "kinetic"], used, times)
 
@@ -227,10 +221,10 @@ class StartModel(nn.Module):
             if not len(known):
                 return each
             own = torch.eye(self.n_bands, device=times.device)[:, None].expand_as(each) > 0
-            inside, outside = (_between(known, self.scale[row, part][None, :, None], times) for part in range(2))
+            inside, outside = (interpolated(known, self.scale[row, part][None, :, None], times) for part in range(2))
             return each * torch.where(own, inside, outside)
         early = (times / known[0]).clamp(max=1).square()
-        return _between(known, self.stderr[row], times) * early[:, None]
+        return interpolated(known, self.stderr[row], times) * early[:, None]
 
     def check(self, start: StartEnergy) -> None:
         """An error for a start on rings of another length."""
@@ -240,13 +234,11 @@ class StartModel(nn.Module):
             )
 
 
-def _between(known: Tensor, values: Tensor, times: Tensor) -> Tensor:
-    """Of values [any, known time, any], those at other times: between the nearest two, and beyond the ends the last."""
-    if len(known) == 1:
-        return values.expand(-1, len(times), -1)
-    after = torch.searchsorted(known, times.contiguous()).clamp(1, len(known) - 1)
-    weight = ((times - known[after - 1]) / (known[after] - known[after - 1])).clamp(0, 1)[:, None]
-    return torch.lerp(values[:, after - 1], values[:, after], weight.to(values))
+def _change(of: Callable[[Tensor], Tensor], times: Tensor) -> tuple[Tensor, Tensor]:
+    """By how much a function of the times changes about each, and in which time, (time,)."""
+    step = STEP * (1 + times).clamp(max=10.0)
+    before = (times - step).clamp(min=0)
+    return of(times + step) - of(before), times + step - before
 
 
 def can_fit(transfer: BandTransfer) -> bool:
@@ -271,7 +263,7 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
     picked = chosen_times(transfer.times)
     whole = transfer.times[picked], transfer.mean[:, picked].double(), transfer.stderr[:, picked].double()
     late = transfer.long_time if len(picked) else None
-    coefficients: dict[str, Tensor] = {}
+    coefficients: dict[str, Any] = {}
     with single_blas_thread():
         for kind in KINDS:
             mean, stderr = _in_bands(getattr(starts, kind))[:, later], getattr(starts, f"{kind}_stderr")[:, later]
@@ -295,9 +287,7 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
             coefficients[kind] = torch.from_numpy(found[0])
     none = torch.zeros(0, dtype=torch.float64)
     return StartModel(
-        torch.tensor(degrees, dtype=torch.float64), **coefficients, frequency=tones.frequency, decay=tones.decay,
-        coupling=tones.coupling, scale_times=none, scale=none.expand(2, 2, 0), n_bands=scene.n_bands, rigid=tones.rigid,
-        onset=tones.onset,
+        torch.tensor(degrees, dtype=torch.float64), **coefficients, scale_times=none, scale=none.expand(2, 2, 0), **vars(tones)
     )  # fmt: skip
 
 
@@ -325,7 +315,7 @@ def between(lower: tuple[float, StartModel], upper: tuple[float, StartModel], sc
         return None
     part, tones = math.log(scene.disorder.strength / low) / math.log(high / low), _tones(scene)
     mixed = {kind: torch.lerp(getattr(first, kind), getattr(last, kind), part) for kind in KINDS}
-    own = {name: getattr(tones, name) for name in ("frequency", "decay", "coupling", "rigid", "onset")}
+    own = {name: value for name, value in vars(tones).items() if name != "n_bands"}
     errors = {"scale": torch.maximum(first.scale, last.scale)}
     if first.stderr.shape == last.stderr.shape:
         errors["stderr"] = torch.maximum(first.stderr, last.stderr)

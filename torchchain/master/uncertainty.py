@@ -24,7 +24,7 @@ from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.alike import factors, group_of, variance
 from torchchain.master.fits import FitWarning
 from torchchain.master.misfit import model_error
-from torchchain.master.model import TransferModel
+from torchchain.master.model import TransferModel, shaped
 from torchchain.master.records import Progress, Recipe
 from torchchain.master.sample import Sample, block_weights
 
@@ -88,22 +88,16 @@ class Uncertainty:
 
     def at(self, times: Tensor) -> Tensor:
         """Standard error of the prediction from each band, [source, time, receiver]."""
-        return self._at(self.stderr.to(times), times)
-
-    def _at(self, values: Tensor, times: Tensor) -> Tensor:
-        """Of values [any, time, band], those at other times."""
-        kept = self.times.to(values)
-        after = torch.searchsorted(kept, times.contiguous()).clamp(1, len(kept) - 1)
-        low, high = kept[after - 1], kept[after]
-        weight = ((times - low) / (high - low)).clamp(0, 1)[:, None]
-        return values[:, after - 1] * (1 - weight) + values[:, after] * weight
+        return interpolated(self.times.to(times), self.stderr.to(times), times)
 
     def parts(self, times: Tensor) -> tuple[Tensor, Tensor]:
         """Variances of the prediction from each band, by the ensemble's noise and by the model's misfit, [source, time, receiver]."""
         every = self.at(times).square()
         if self.misfit_share is None:
             return every, torch.zeros_like(every)
-        inside, outside = self._at(self.misfit_share.to(times), times).transpose(1, 2)[..., None]
+        inside, outside = interpolated(self.times.to(times), self.misfit_share.to(times), times).transpose(1, 2)[
+            ..., None
+        ]
         misfit = every * torch.where(_own(every), inside, outside)
         return every - misfit, misfit
 
@@ -146,9 +140,7 @@ class Uncertainty:
             **({} if alike is None else {"alike": (alike, (len(alike), n, int(group_of(count)[-1]) + 1, n))}),
         }  # fmt: skip
         for name, (value, shape) in every.items():
-            checks.real_tensor(name, value)
-            if tuple(value.shape) != shape:
-                raise checks.fail(name, f"have shape {shape}", f"shape {tuple(value.shape)}")
+            shaped(name, value, shape)
             if name != "alike":
                 checks.first_bad(name, "not be negative", value, value < 0)
             else:
@@ -158,6 +150,16 @@ class Uncertainty:
         if misfit_share is not None:
             checks.first_bad("misfit_share", "be at most 1", misfit_share, misfit_share > 1)
         return cls(rates_stderr, basis_stderr, stderr_times, stderr, misfit_share, alike)
+
+
+def interpolated(known: Tensor, values: Tensor, times: Tensor) -> Tensor:
+    """Of values [any, known time, any], those at other times: between the nearest two, and beyond the ends the last."""
+    if len(known) == 1:
+        return values.expand(-1, len(times), -1)
+    after = torch.searchsorted(known, times.contiguous()).clamp(1, len(known) - 1)
+    low, high = known[after - 1], known[after]
+    weight = ((times - low) / (high - low)).clamp(0, 1)[:, None]
+    return values[:, after - 1] * (1 - weight) + values[:, after] * weight
 
 
 def of_parts(
