@@ -17,7 +17,7 @@ from torchchain.master.certificate import certify
 from torchchain.master.certified import certified
 from torchchain.master.compact import OddsModel
 from torchchain.master.equation import MasterEquation
-from torchchain.master.fits import FitWarning, checked_window, within
+from torchchain.master.fits import WINDOW, FitWarning, checked_window, within
 from torchchain.master.ladder import MODELS, fitted_by, methods
 from torchchain.master.memory import MemoryModel, ProjectionReport
 from torchchain.master.model import TransferModel
@@ -31,7 +31,6 @@ from torchchain.master.uncertainty import draw_again, horizon
 from torchchain.progress import bar
 from torchchain.threads import beside, core_free, single_blas_thread
 
-LINEAR_WINDOW = (0.5, 2.0)  # first and last time, in travel times of sound over one particle
 REPLICATES = 20
 """Of the bootstrap, where fits are quick."""
 
@@ -59,7 +58,7 @@ def recipe(
     elif record is not None and fit is None:
         fit = record.fit()
     if record is None or fit is None:
-        chosen, n_times, given = NoSettings(), 2, LINEAR_WINDOW
+        chosen, n_times, given = NoSettings(), 2, WINDOW
     else:
         if fit not in record.fits:
             able = ", ".join(other.name for other in fitted_by(fit.name))

@@ -266,14 +266,12 @@ def _header(where: str, header: Any) -> dict[str, Any]:
 
 def _tensors(where: str, file: Any, headers: Sequence[Mapping[str, Any]], form: str) -> list[dict[str, torch.Tensor]]:
     """The tensors of every model of a file, no more and no less than the headers say."""
-    names = set(file.keys())
-    if form == FORMAT:
-        return [_model_tensors(where, file, headers[0], "", names)]
-    found = []
+    names, found = set(file.keys()), []
     for i, header in enumerate(headers):
-        own = {name for name in names if name.startswith(f"{i}.")}
+        prefix = "" if form == FORMAT else f"{i}."
+        own = {name for name in names if name.startswith(prefix)}
         names -= own
-        found.append(_model_tensors(where, file, header, f"{i}.", own))
+        found.append(_model_tensors(where, file, header, prefix, own))
     if names:
         raise checks.fail(where, f"hold the tensors of {len(headers)} models", checks.shown(sorted(names)[:4]))
     return found

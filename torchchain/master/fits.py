@@ -14,6 +14,9 @@ from torch import Tensor
 
 from torchchain import checks
 
+WINDOW = (0.5, 2.0)
+"""First and last time of the straight lines of procedure L, in travel times of sound over one particle."""
+
 
 class FitWarning(UserWarning):
     """Some entries of a fit did not converge.

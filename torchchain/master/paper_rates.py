@@ -12,13 +12,11 @@ from torchchain import checks
 from torchchain.ensemble.statistics import jackknife_error
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.diagnostics import without_one
-from torchchain.master.fits import checked_window, linear_weights
+from torchchain.master.fits import WINDOW, checked_window, linear_weights
 from torchchain.master.sample import Sample, paper_basis
 
 if TYPE_CHECKING:
     import xarray
-
-WINDOW = (0.5, 2.0)  # first and last time, in travel times of sound over one particle
 
 
 def paper_rates(

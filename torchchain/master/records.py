@@ -12,6 +12,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.scene import Scene
 from torchchain.ensemble.transfer import BandTransfer
+from torchchain.master.fits import WINDOW
 from torchchain.master.model import TransferModel
 from torchchain.master.sample import Sample
 
@@ -57,7 +58,7 @@ class Fit:
     run: Callable[..., Fitted]
     settings: type = NoSettings
     report: type | None = None
-    window: tuple[float, float] = (0.5, 2.0)
+    window: tuple[float, float] = WINDOW
     least_times: int = 2
     quick: bool = True
     check: Callable[[Any, int], Any] = lambda settings, n_times: None

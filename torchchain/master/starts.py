@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torchchain import checks
 from torchchain.energy.start_energy import StartEnergy
 from torchchain.ensemble.scene import Scene
-from torchchain.ensemble.starts import KINDS
+from torchchain.ensemble.starts import KINDS, StartTransfer
 from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.alike import variance
@@ -246,15 +246,19 @@ def can_fit(transfer: BandTransfer) -> bool:
     return transfer.starts is not None and transfer.scene is not None and not transfer.is_ordered
 
 
+def _told(transfer: BandTransfer) -> tuple[Scene, StartTransfer]:
+    """The chains and their other starts of a transfer that tells of them."""
+    assert transfer.scene is not None and transfer.starts is not None, "can_fit has said so"  # noqa: PT018
+    return transfer.scene, transfer.starts
+
+
 def fit_starts(transfer: BandTransfer) -> StartModel:
     """The model of a transfer's starts; a second for 32 bands.
 
     Waves released at rest also see the calibrated tones of the ensemble at all of its times. Where its long-time average
     is known both kinds are held to it: what kicks then differ by is taken from the last time.
     """
-    scene, starts = transfer.scene, transfer.starts
-    assert scene is not None, "can_fit has said so"
-    assert starts is not None, "and so"
+    scene, starts = _told(transfer)
     tones = _tones(scene)
     degrees = (*DEGREES[:2], max(2, min(DEGREES[2], (len(starts.times) - 1) // 2)))
     numbers, own = (torch.tensor(found) - 1 for found in (starts.tones, scene.tones))
@@ -341,9 +345,7 @@ def with_errors(model: StartModel, transfer: BandTransfer, uncertainty: Uncertai
     Fits of waves released at rest follow as much as the bands' own model, of kicked ones, and in bands other than the source's
     where it is told from misfit, as much as ``FOLLOWED`` says.
     """
-    starts, scene = transfer.starts, transfer.scene
-    assert starts is not None, "the model was fitted to them"
-    assert scene is not None, "and of these chains"
+    scene, starts = _told(transfer)
     times, n = starts.times[1:], scene.n_bands
     base = uncertainty.at(times.double()).square()
     numbers, own = torch.tensor(starts.tones) - 1, torch.eye(n, dtype=torch.bool)[:, None].expand_as(base)
