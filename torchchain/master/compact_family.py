@@ -108,7 +108,7 @@ def between(
     near = nearest(strength, known)
     other = scene.stiffness_disorder
     beside = 0.0 if other is None else other.strength
-    waves = Waves.of(scene, math.hypot(strength, beside))
+    waves = Waves.of(at_strength(scene, strength))
     mixed = {name: summed(name, near) for name in ("rates", "loss")}
     degrees = checked_degrees([int(degree) for degree in tensors[0]["degrees"]])
     told = max(strength, THEORY_WEAKEST)

@@ -34,6 +34,7 @@ from torchchain.master.model import shaped
 from torchchain.master.polynomials import checked_degrees, n_coefficients
 from torchchain.master.tones import ONSET, ToneRegression, Tones, shares
 from torchchain.master.uncertainty import Uncertainty, interpolated
+from torchchain.master.waves import whole_strength
 from torchchain.threads import single_blas_thread
 
 DEGREES = (12, 8, 16)
@@ -296,9 +297,7 @@ def fit_starts(transfer: BandTransfer) -> StartModel:
 
 
 def _tones(scene: Scene) -> Tones:
-    other = scene.stiffness_disorder
-    strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
-    return Tones.of(scene.n_particles, scene.n_bands, strength, scene.disorder.strength)
+    return Tones.of(scene.n_particles, scene.n_bands, whole_strength(scene), scene.disorder.strength)
 
 
 def between(lower: tuple[float, StartModel], upper: tuple[float, StartModel], scene: Scene) -> StartModel | None:

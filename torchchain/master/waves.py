@@ -53,17 +53,9 @@ class Waves:
     coupling: Tensor
 
     @classmethod
-    def of(cls, scene: Scene, strength: float | None = None) -> Waves:
-        """The waves of a scene's chains, in the self-consistent Born approximation.
-
-        Args:
-            scene: with one tone in each band.
-            strength: standard deviation of the masses, and of the contacts if they vary too; None for the scene's.
-        """
-        if strength is None:
-            other = scene.stiffness_disorder
-            strength = math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
-        strength = checks.number("strength", strength, above=0)
+    def of(cls, scene: Scene) -> Waves:
+        """The waves of a scene's chains, with one tone in each band, in the self-consistent Born approximation."""
+        strength = checks.number("strength", whole_strength(scene), above=0)
         return _of(scene.n_particles, scene.n_bands, tuple(scene.tones), strength)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -78,6 +70,12 @@ class Waves:
         far = torch.asinh(far / (self.source_decay[:, None] + self.tone_decay.mean(1)))
         low, high = (far[off].min(), far[off].max()) if n > 1 else (far.min(), far.max())
         return ((far - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
+
+
+def whole_strength(scene: Scene) -> float:
+    """Standard deviation of the masses, and of the contacts if they vary too."""
+    other = scene.stiffness_disorder
+    return math.hypot(scene.disorder.strength, 0.0 if other is None else other.strength)
 
 
 @functools.lru_cache(maxsize=16)
