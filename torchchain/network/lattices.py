@@ -169,22 +169,17 @@ def lattice(
                 beyond |= out
             else:
                 gone |= out
-        inside = ~(beyond | gone)
-        if s < half:  # a bond between particles is found from its first end, one to a wall from its only one
-            firsts.append(np.flatnonzero(inside))
-            ends.append(there[inside] @ strides)
-            images.append(turns[inside])
-            steps.append(np.full(inside.sum(), s))
-        held = beyond & ~gone
-        if held.any():
+        # A bond between particles is found from its first end, one to a wall from its only one.
+        for held in (~beyond & ~gone & (s < half), beyond & ~gone):
             firsts.append(np.flatnonzero(held))
-            steps.append(np.full(held.sum(), s))
+            ends.append(there[held] @ strides)
             images.append(turns[held])
-            outside.append(there[held])
-            ends.append(np.full(held.sum(), -1))
+            steps.append(np.full(held.sum(), s))
+        ends[-1][:] = -1
+        outside.append(there[held])
     first, end, image = np.concatenate(firsts), np.concatenate(ends), np.concatenate(images)
     anchors = None
-    if outside:
+    if "fixed" in walls:
         places, which = np.unique(np.concatenate(outside), axis=0, return_inverse=True)
         end[end < 0] = n + which.reshape(-1)
         anchors = torch.from_numpy(places @ primitive)

@@ -105,14 +105,10 @@ def _grains(network: Packing, state: State, step: float) -> Advance:
     radii = network.radii.detach().double().numpy()
     skin = SKIN * float(radii.max())
     home = network.positions.detach().double().numpy()
-    rows = [
-        (home + u, v.copy())
-        for u, v in zip(
-            state.displacement.detach().double().reshape(-1, *shape[-2:]).numpy(),
-            state.velocity.detach().double().reshape(-1, *shape[-2:]).numpy(),
-            strict=True,
-        )
-    ]
+    places, speeds = (
+        x.detach().double().reshape(-1, *shape[-2:]).numpy() for x in (state.displacement, state.velocity)
+    )
+    rows = [(home + u, v.copy()) for u, v in zip(places, speeds, strict=True)]
     masses = network.masses.detach().double().reshape(-1, network.n_particles).numpy()
     starts = max(len(rows) // len(masses), 1)
     hertz = network.contact == "hertz"
@@ -128,14 +124,9 @@ def _grains(network: Packing, state: State, step: float) -> Advance:
 
     listed = [(x.copy(), *lists(x)) for x, _ in rows]
 
-    def push(row: int, x: np.ndarray, v: np.ndarray, force: np.ndarray) -> None:
-        _, pairs, shifts = listed[row]
+    forces = [np.empty_like(x) for x, _ in rows]
+    for (x, v), (_, pairs, shifts), force in zip(rows, listed, forces, strict=True):
         kernels.grain_force(x, radii, pairs, shifts, hertz, network.modulus, gamma, v, force)
-
-    forces = []
-    for row, (x, v) in enumerate(rows):
-        forces.append(np.empty_like(x))
-        push(row, x, v, forces[row])
 
     def advance(times: Tensor) -> NetworkTrajectory:
         nonlocal now
