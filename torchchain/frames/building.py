@@ -85,8 +85,7 @@ def _marked(box: Box | None, options: dict[str, Any]) -> Box | None:
     marks = options.get("periodic")
     if box is None or not marks:
         return box
-    x, y, z = (flag or axis in marks for axis, flag in zip(AXES, box.periodic, strict=True))
-    return replace(box, periodic=(x, y, z))
+    return replace(box, periodic=tuple(f or axis in marks for axis, f in zip(AXES, box.periodic, strict=True)))
 
 
 def kept(frame: Frame, places: Tensor) -> Frame:

@@ -128,9 +128,8 @@ def _box(here: str, words: list[str], lines: list[str]) -> Box:
         if not low <= high:
             raise checks.fail(f"{here}: BOX BOUNDS", f"have {axis} bounds in order", f"{low:g} {high:g}")
     flags = words if len(words) == 3 else ["?"] * 3
-    (xl, xh), (yl, yh), (zl, zh) = bounds
-    px, py, pz = (flag.startswith("p") for flag in flags)
-    return Box((xl, yl, zl), (xh, yh, zh), (px, py, pz))
+    lower, upper = zip(*bounds, strict=True)
+    return Box(lower, upper, tuple(flag.startswith("p") for flag in flags))
 
 
 def scan_dump(path: Path, label: str) -> Scan:

@@ -90,8 +90,8 @@ def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iter
 def _box(corners: list[float]) -> Box:
     """The domain. The file does not say which boundaries are periodic, and MercuryDPM wraps at those that are."""
     half = len(corners) // 2
-    low, high = ([*side, 0.0][:3] for side in (corners[:half], corners[half:]))
-    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]), (False, False, False))
+    low, high = ((*side, 0.0)[:3] for side in (corners[:half], corners[half:]))
+    return Box(low, high, (False,) * 3)
 
 
 def _columns(here: str, text: Text, dimensions: int) -> tuple[str, ...]:

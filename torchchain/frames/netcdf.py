@@ -227,8 +227,8 @@ def _read(path: Path, entries: Iterable[Entry], options: dict[str, Any]) -> Iter
                     )
             box = None
             if flags is not None:
-                (xl, yl, zl), (xh, yh, zh) = held["box_lower"][at].tolist(), held["box_upper"][at].tolist()
-                box = Box((xl, yl, zl), (xh, yh, zh), (bool(flags[0]), bool(flags[1]), bool(flags[2])))
+                lower, upper = (tuple(held[name][at].tolist()) for name in ("box_lower", "box_upper"))
+                box = Box(lower, upper, tuple(map(bool, flags)))
             contacts = None
             if of_frame is not None:
                 low, high = np.searchsorted(of_frame, [entry.offset, entry.offset + 1])

@@ -44,9 +44,9 @@ class Box:
         tensor([10.,  1.,  1.], dtype=torch.float64)
     """
 
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
-    periodic: tuple[bool, bool, bool]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    periodic: tuple[bool, ...]
 
     @property
     def lengths(self) -> Tensor:

@@ -136,8 +136,8 @@ def scaled_frame(frame: Frame, units: Any) -> Frame:
     length, time, mass, force = (float(units.unit(name)) for name in ("length", "time", "mass", "force"))
     box, contacts = frame.box, frame.contacts
     if box is not None:
-        lower, upper = ([bound / length for bound in bounds] for bounds in (box.lower, box.upper))
-        box = Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]), box.periodic)
+        lower, upper = (tuple(bound / length for bound in bounds) for bounds in (box.lower, box.upper))
+        box = Box(lower, upper, box.periodic)
     if contacts is not None:
         overlap = None if contacts.overlap is None else contacts.overlap / length
         normal = None if contacts.normal_force is None else contacts.normal_force / force

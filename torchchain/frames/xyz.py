@@ -150,9 +150,7 @@ def _convert(here: str, atoms: Any) -> Raw:
     if cell.any():
         if np.any(cell - np.diag(np.diag(cell))) or (np.diag(cell) < 0).any():
             raise checks.fail(f"{here}: Lattice", "be that of a box with sides along x, y, z (no tilt)", cell.tolist())
-        px, py, pz = (bool(p) for p in atoms.pbc)
-        x, y, z = (float(length) for length in np.diag(cell))
-        box = Box((0.0, 0.0, 0.0), (x, y, z), (px, py, pz))
+        box = Box((0.0,) * 3, tuple(np.diag(cell).tolist()), tuple(map(bool, atoms.pbc)))
     return Raw(found, box)
 
 

@@ -219,13 +219,9 @@ def structure_factor(
     waves: list[Tensor] = []
     if isinstance(network, Lattice):
         for turns in torch.as_tensor(wavevectors).tolist():
-            for phase in ("sin", "cos"):
-                try:
-                    waves.append(plane_wave(network, turns, polarization, 1.0, phase).displacement)
-                except checks.FieldError:  # a sine that vanishes: its cosine is all there is
-                    if phase == "cos":
-                        raise
-                    waves.append(plane_wave(network, turns, polarization, 1.0, "cos").displacement)
+            # Of a sine that vanishes the cosine is all there is.
+            first = "cos" if all(2 * t % n == 0 for t, n in zip(turns, network.shape, strict=False)) else "sin"
+            waves += [plane_wave(network, turns, polarization, 1.0, phase).displacement for phase in (first, "cos")]
     else:
         scalar = network.n_components == 1
         checks.choice("polarization", polarization, ("scalar",) if scalar else POLARIZATIONS)
