@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from torchchain.ensemble.scene import Scene
-from torchchain.ensemble.statistics import statistical_distance
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.compact import CompactModel
 from torchchain.master.compact_record import (
@@ -342,7 +341,7 @@ def _seen(member: MasterEquation) -> Sample:
     late = None if damped else member.basis.detach()
     return Sample(
         times, member.model.transfer(times).detach(), late, scene.disorder.strength, damped, scene,
-        None if errors is None else statistical_distance(errors.stderr).mean(0),
+        None if errors is None else errors.stderr,
     )  # fmt: skip
 
 

@@ -31,7 +31,7 @@ class Sample:
         strength: disorder xi, or None if unknown.
         damped: whether the chains lose energy.
         scene: of the chains, or None.
-        distance: expected total variation of two whole ensembles at each time, (time,), or None.
+        stderr: of the mean of the whole ensemble, [source, time, receiver], or None.
 
     Example:
         >>> transfer = tc.band_transfer(tc.Scene(n_particles=64, n_bands=8, realizations=40), method="modes")
@@ -46,17 +46,16 @@ class Sample:
     strength: float | None
     damped: bool = False
     scene: Scene | None = None
-    distance: Tensor | None = None
+    stderr: Tensor | None = None
 
     @classmethod
     def of(cls, transfer: BandTransfer) -> Sample:
         """The whole ensemble."""
         scene = transfer.scene
         strength = None if scene is None else scene.disorder.strength
-        found = statistical_distance(transfer.stderr).mean(0)
-        told = bool(found.isfinite().all()) and bool((found > 0).any())
-        damped, distance = transfer.damping > 0, found if told else None
-        return cls(transfer.times, transfer.mean, transfer.long_time, strength, damped, scene, distance)
+        return cls(
+            transfer.times, transfer.mean, transfer.long_time, strength, transfer.damping > 0, scene, transfer.stderr
+        )  # fmt: skip
 
     @classmethod
     def of_blocks(cls, transfer: BandTransfer, repeats: Tensor) -> Sample:
@@ -79,6 +78,14 @@ class Sample:
     @property
     def n_bands(self) -> int:
         return self.mean.shape[-1]
+
+    @kept_property
+    def distance(self) -> Tensor | None:
+        """Expected total variation of two whole ensembles at each time, (time,), or None."""
+        if self.stderr is None:
+            return None
+        found = statistical_distance(self.stderr).mean(0)
+        return found if bool(found.isfinite().all()) and bool((found > 0).any()) else None
 
     def distribution(self) -> Sample:
         """The share of each band in what is left of the energy: what is measured where nothing is lost."""

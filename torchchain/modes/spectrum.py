@@ -102,7 +102,7 @@ def normal_modes(chain: Chain) -> NormalModes:
             f"up to {chain.contact_damping.max().item():g}",
         )
     weight = chain.masses.rsqrt()
-    symmetric = -chain.stiffness_matrix() * weight[..., :, None] * weight[..., None, :]
+    symmetric = chain.stiffness_matrix() * -weight[..., :, None] * weight[..., None, :]
     try:
         squared, vectors = torch.linalg.eigh(symmetric)
     except torch.linalg.LinAlgError as error:  # torch's own message names the member of the batch
