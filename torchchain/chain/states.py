@@ -92,21 +92,3 @@ class Trajectory:
         """The state at the last time."""
         time = -1 - len(self.axes_of_a_state)
         return State(self.displacement.select(time, -1), self.velocity.select(time, -1))
-
-
-def join(parts: list[Trajectory]) -> Trajectory:
-    """One trajectory from consecutive windows."""
-    if len(parts) == 1:
-        return parts[0]
-
-    def series(name: str, axis: int) -> Tensor | None:
-        pieces = [getattr(part, name) for part in parts]
-        return None if pieces[0] is None else torch.cat(pieces, dim=axis)
-
-    return Trajectory(
-        torch.cat([part.times for part in parts]),
-        torch.cat([part.displacement for part in parts], dim=-2),
-        torch.cat([part.velocity for part in parts], dim=-2),
-        series("dissipated", -1),
-        series("openings", -1),
-    )

@@ -157,7 +157,7 @@ class Checkpoint:
             elif _NAME.fullmatch(path.name):
                 try:
                     found.append(_read(path))
-                except _Damage as damage:
+                except ValueError as damage:
                     self._discard(path, str(damage))
         replaced = {name for part in found for name in part.header["replaces"]}
         for name in replaced:
@@ -238,13 +238,10 @@ class Writer:
         """Keep what is finished, if the run has lasted long enough to, and say what is kept."""
         self.close(moments)
         kept = self.checkpoint.resumed + self.kept
-        words = (
-            f"interrupted: {kept} of {moments.realizations} realizations are kept in {self.path.parent}, "
-            "the same command goes on from there"
-            if kept
-            else "interrupted, nothing was written"
-        )
-        return Interrupted(words)
+        if not kept:
+            return Interrupted("interrupted, nothing was written")
+        held = f"{kept} of {moments.realizations} realizations are kept in {self.path.parent}"
+        return Interrupted(f"interrupted: {held}, the same command goes on from there")
 
 
 @contextmanager
@@ -272,12 +269,8 @@ class _Part:
     tensors: dict[str, Tensor]
 
 
-class _Damage(Exception):
-    pass
-
-
 def _read(path: Path) -> _Part:
-    """A part, checked to be what was written."""
+    """A part, checked to be what was written; a ValueError says why it is not."""
     try:
         content = path.read_bytes()
         size = int.from_bytes(content[:8], "little")
@@ -285,12 +278,12 @@ def _read(path: Path) -> _Part:
         tensors = load(content)
         text, digest = metadata["header"], metadata["sha256"]
     except (SafetensorError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise _Damage(f"no whole file: {checks.shown(str(error), 60)}") from None
+        raise ValueError(f"no whole file: {checks.shown(str(error), 60)}") from None
     if digest != _digest(text, tensors):
-        raise _Damage("its checksum differs")
+        raise ValueError("its checksum differs")
     header = json.loads(text)
     if header.get("format") != FORMAT:
-        raise _Damage(f"its format is not {FORMAT}")
+        raise ValueError(f"its format is not {FORMAT}")
     return _Part(path, header, tensors)
 
 

@@ -128,13 +128,8 @@ def band_energy(
     if definition == "bond" and chain.boundary != "periodic":
         raise checks.fail("boundary", "be 'periodic' for definition 'bond' in wavenumber space", repr(chain.boundary))
     if not isinstance(advance, CompiledAdvance):
-        return torch.cat(
-            [
-                wavenumber.band_energy(chain, advance(window), n_bands, normalize, definition)
-                for window in _windows(times, state)
-            ],
-            dim=-2,
-        )
+        paths = map(advance, _windows(times, state))
+        return torch.cat([wavenumber.band_energy(chain, p, n_bands, normalize, definition) for p in paths], dim=-2)
     from torchchain.evolvers import records
 
     kind, count, strain = records.BOND_FIELDS, 2, np.zeros(chain.n_particles // 2 + 1)

@@ -16,11 +16,9 @@ if TYPE_CHECKING:
 
 def describe(scene: Scene) -> str:
     """The scene in one line, for titles and logs."""
-    wave = (
-        f"impulse at particle {scene.excitation.site}"
-        if isinstance(scene.excitation, Impulse)
-        else f"{len(scene.tones)} standing waves"
-    )
+    wave = f"{len(scene.tones)} standing waves"
+    if isinstance(scene.excitation, Impulse):
+        wave = f"impulse at particle {scene.excitation.site}"
     end = np.format_float_positional(float(scene.times[-1]), trim="-")
     pairs = " in opposite pairs" if scene.sample_size == 2 else ""
     what = f"{scene.boundary} chains{pairs}, N = {scene.n_particles}"
