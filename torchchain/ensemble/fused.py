@@ -9,7 +9,6 @@ the other.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -232,7 +231,6 @@ def _binned(
     return [torch.from_numpy(found).reshape(*shape, n_bands).to(state.displacement.dtype) for found in bands]
 
 
-def _windows(times: Tensor, state: State) -> Iterator[Tensor]:
+def _windows(times: Tensor, state: State) -> tuple[Tensor, ...]:
     """Windows of times whose states fit in some 100 MB."""
-    size = max(1, 2**23 // state.displacement.numel())
-    yield from times.to(state.displacement.device).split(size)
+    return times.to(state.displacement.device).split(max(1, 2**23 // state.displacement.numel()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -110,14 +111,12 @@ def condition_of(starts: Tensor) -> float:
     if not float(sizes[weakest]) > 1e-6 * float(sizes.max()):
         raise checks.fail("starts", "excite every band in some run", f"none in band {weakest + 1}")
     singular = torch.linalg.svdvals(starts / sizes)
-    if len(starts) < starts.shape[1] or not float(singular[-1]) * LARGEST_CONDITION > float(singular[0]):
-        condition = "infinite" if len(starts) < starts.shape[1] else f"{float(singular[0] / singular[-1]):.3g}"
-        raise checks.fail(
-            "starts",
-            f"tell the {starts.shape[1]} bands apart (a condition number of at most {LARGEST_CONDITION:g})",
-            f"{condition} with {len(starts)} runs",
-        )
-    return float(singular[0] / singular[-1])
+    condition = float(singular[0] / singular[-1]) if len(starts) >= starts.shape[1] else math.inf
+    if not condition < LARGEST_CONDITION:
+        rule = f"tell the {starts.shape[1]} bands apart (a condition number of at most {LARGEST_CONDITION:g})"
+        words = "infinite" if math.isinf(condition) else f"{condition:.3g}"
+        raise checks.fail("starts", rule, f"{words} with {len(starts)} runs")
+    return condition
 
 
 def _solved(starts: Tensor, energies: Tensor) -> Tensor:

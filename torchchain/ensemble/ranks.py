@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
 
 from torchchain.ensemble.statistics import EnsembleMoments
 
@@ -77,12 +78,18 @@ class Ranks:
         with _connected():
             while step < self.size:
                 if self.rank % (2 * step):
-                    dist.send_object_list([moments.tensors()], dst=self.rank - step, device=_HOST)
+                    plain = moments.tensors()
+                    dist.send_object_list([_outline(plain)], dst=self.rank - step, device=_HOST)
+                    for values in plain.values():
+                        dist.send(values, dst=self.rank - step)
                     break
                 if self.rank + step < self.size:
                     held: list[Any] = [None]
                     dist.recv_object_list(held, src=self.rank + step, device=_HOST)
-                    moments.absorb(moments.again(held[0]))
+                    plain = _room(held[0])
+                    for values in plain.values():
+                        dist.recv(values, src=self.rank + step)
+                    moments.absorb(moments.again(plain))
                 step *= 2
         return moments
 
@@ -90,7 +97,12 @@ class Ranks:
         """Rank 0's moments on every rank."""
         if self.size == 1:
             return moments
-        plain = self.agree(moments.tensors() if self.rank == 0 else None)
+        plain = moments.tensors() if self.rank == 0 else {}
+        outline = self.agree(_outline(plain))
+        plain = plain or _room(outline)
+        with _connected():
+            for values in plain.values():
+                dist.broadcast(values, src=0)
         return moments if self.rank == 0 else moments.again(plain)
 
 
@@ -159,3 +171,13 @@ def _connected() -> Iterator[None]:
         yield
     except RuntimeError as error:
         raise RuntimeError("another process of this run has ended or cannot be reached") from error
+
+
+def _outline(plain: Mapping[str, Tensor]) -> list[tuple[str, torch.Size, torch.dtype]]:
+    """What is to be known of tensors before they pass: as such, as pickling them would take far longer."""
+    return [(name, values.shape, values.dtype) for name, values in plain.items()]
+
+
+def _room(outline: list[tuple[str, torch.Size, torch.dtype]]) -> dict[str, Tensor]:
+    """Tensors to be filled."""
+    return {name: torch.empty(shape, dtype=dtype) for name, shape, dtype in outline}
