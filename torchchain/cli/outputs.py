@@ -127,11 +127,11 @@ def write(out: str | Path, writers: dict[str, Writer], aside: Path | None = None
         aside: of :func:`staging` for the same folder, where it was asked for before; writers of files that lie there already
             wait for them.
     """
-    log.info("writing %s", out)
     if aside is None:
         with staging(out) as folder:
             write(out, writers, folder)
         return
+    log.info("writing %s", out)
     with _reported(Path(out)):
         out = Path(out).absolute()
         for name, writer in writers.items():
