@@ -181,6 +181,7 @@ def test_commands(tmp_path, monkeypatch, capsys):
         ({"species": "soft"}, "species must be a list of species"),
         ({"species": ("soft: hardness=1",)}, "species must have only the keys name, mass"),
         ({"species": ("soft: mass=x",)}, "species must be 'NAME: FIELD=NUMBER, ...'"),
+        ({"species": ("soft mass=1", "hard")}, "species must be 'NAME: FIELD=NUMBER, ...', got 'soft mass=1'"),
         ({"species": ({"mass": 1.0},)}, "species must have a name each"),
         ({"species": (Species("a", fraction=0.2), Species("b"))}, "species.fraction must sum up to 1"),
         ({"arrangement": "stacked"}, "arrangement must be one of"),

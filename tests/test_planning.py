@@ -249,6 +249,12 @@ def test_contact_and_method_share_the_tolerance():
     assert all(step[name] < free[name] for name in step)
 
 
+def test_hardly_any_disorder_asks_for_no_more_than_chains_all_the_same():
+    wanted = [scene(disorder=tc.Disorder(strength=xi), observables=("energy",)) for xi in (0.0, 1e-300)]
+    first, second = map(plan, wanted)
+    assert first.tolerance == second.tolerance > second.predicted_error
+
+
 def test_hertz_by_amplitude_has_no_bands():
     waves = tc.StandingWave(amplitude=0.5)
     wanted = scene(contact="auto", tolerance=1e-6, excitation=waves, observables=("band_energy",), n_bands=4)

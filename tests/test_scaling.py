@@ -211,3 +211,6 @@ def test_masses_in_other_units_are_remarked_upon():
         for factor in (0.6, 1.9):  # a mean by chance
             usual = tc.Chain(factor * torch.ones(16, dtype=torch.float64))
             tc.evolve(usual, tc.impulse(usual), [0.0, 1.0])
+    cut = tc.Disorder("gamma", 5.0)  # most of its values are below 0.05, and drawn again
+    with pytest.warns(tc.UnitsWarning, match=r"masses have mean [3-6]\.\d+, where the unit of mass is their mean"):
+        tc.simulate(tc.Scene(n_particles=16, n_bands=4, realizations=4, times=[1.0], disorder=cut), "modes")

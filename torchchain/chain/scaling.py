@@ -143,10 +143,15 @@ def warn_if_unscaled(chain: Chain, stacklevel: int = 2) -> None:
     """
     if checks.is_transformed(chain.masses):
         return
-    mean = chain.masses.detach().mean().item()
+    mean, stiffness = (field.detach().mean().item() for field in (chain.masses, chain.contact_stiffness))
+    warn_of_mean(mean, stiffness, stacklevel + 1)
+
+
+def warn_of_mean(mean: float, stiffness: float = 1.0, stacklevel: int = 2) -> None:
+    """The same of a mean mass, beside the mean stiffness of the contacts."""
     if 1 / FAR <= mean <= FAR:
         return
-    speed = math.sqrt(chain.contact_stiffness.detach().mean().item() / mean)
+    speed = math.sqrt(stiffness / mean)
     warnings.warn(
         f"masses have mean {mean:.3g}, where the unit of mass is their mean: sound travels {speed:.3g} particles per unit of "
         "time, not one (divide masses by their mean and stiffnesses by theirs, or see Scaling)",

@@ -305,7 +305,7 @@ def _tolerance(scene: Scene) -> tuple[float, list[str]]:
         return ORDERED_TOLERANCE, [f"no tolerance asked for and no ensemble error: {ORDERED_TOLERANCE:.0e}"]
     noise = statistical_error(scene)
     why = f"no tolerance asked for: a third of the ensemble's own error, about {noise:.1e}"
-    return FRACTION_OF_NOISE * noise, [why]
+    return max(FRACTION_OF_NOISE * noise, ORDERED_TOLERANCE), [why]
 
 
 def _settled(

@@ -20,6 +20,7 @@ import torch
 
 from torchchain import checks, progress
 from torchchain.chain.amplitude import elongation_estimate, warn_if_nonlinear
+from torchchain.chain.scaling import warn_of_mean
 from torchchain.ensemble import plan as planning
 from torchchain.ensemble.checkpoint import Checkpoint, Kept, Writer, uninterrupted
 from torchchain.ensemble.chunk import Chunk
@@ -251,7 +252,10 @@ def ensemble_moments(
         total = ranks.total(_collected(parts, EnsembleMoments(*cut), writer, stages, waits=ranks.size > 1))
         if ranks.rank == 0:
             total.absorb(kept.moments)
-        return Ensemble(ranks.everywhere(total), run.method, run.options)
+        found = Ensemble(ranks.everywhere(total), run.method, run.options)
+    if ranks.rank == 0:
+        warn_of_mean(found.attributes["mass_mean"], stacklevel=4)
+    return found
 
 
 def _moments_of(chunk: Chunk, cut: tuple[int, int, int]) -> EnsembleMoments:

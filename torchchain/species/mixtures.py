@@ -88,6 +88,8 @@ class Species(checks.Fields):
             return plain
         if isinstance(plain, str):
             name, _, rest = plain.partition(":")
+            if "=" in name:
+                raise checks.fail("species", "be 'NAME: FIELD=NUMBER, ...'", repr(plain))
             table: dict[str, Any] = {"name": name.strip()}
             for word in filter(None, (part.strip() for part in rest.split(","))):
                 key, _, value = (part.strip() for part in word.partition("="))
