@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
-import operator
 import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -105,10 +104,14 @@ def number(
         raise fail(field, "be finite", value) from None
     if not math.isfinite(value):
         raise fail(field, "be finite", value)
-    bounds = {"greater than": above, "at least": at_least, "less than": below, "at most": at_most}
-    for (words, bound), holds in zip(bounds.items(), (operator.gt, operator.ge, operator.lt, operator.le), strict=True):
-        if bound is not None and not holds(value, bound):
-            raise fail(field, f"be {words} {bound:g}", value)
+    if above is not None and not value > above:
+        raise fail(field, f"be greater than {above:g}", value)
+    if at_least is not None and not value >= at_least:
+        raise fail(field, f"be at least {at_least:g}", value)
+    if below is not None and not value < below:
+        raise fail(field, f"be less than {below:g}", value)
+    if at_most is not None and not value <= at_most:
+        raise fail(field, f"be at most {at_most:g}", value)
     return value
 
 
