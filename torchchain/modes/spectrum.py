@@ -156,11 +156,14 @@ def checked_modes(chain: Chain, vectors: Tensor) -> NormalModes:
     elongation = chain.elongation(across)
     tension = chain.contact_stiffness[..., None, :] * elongation
     squared = (tension * elongation).sum(-1)
-    force = chain.net(tension) * weight[..., None, :]
-    residual = (force + squared[..., :, None] * across / weight[..., None, :]).detach().abs().amax((-2, -1))
-    gram = (vectors.mT @ vectors).detach()
-    gram.diagonal(dim1=-2, dim2=-1).sub_(1)
-    orthogonality = gram.abs().amax((-2, -1))
+    with torch.no_grad():  # in place: of fresh memory every page would cost as much as the arithmetic on it
+        residual = chain.net(tension).mul_(weight[..., None, :])
+        residual.add_((squared[..., :, None] * across).div_(weight[..., None, :]))
+        residual = residual.abs_().amax((-2, -1))
+        del tension, elongation, across
+        gram = vectors.mT @ vectors
+        gram.diagonal(dim1=-2, dim2=-1).sub_(1)
+        orthogonality = gram.abs_().amax((-2, -1))
     limit = 40 * torch.finfo(shapes.dtype).eps * chain.n_particles**0.5
     where = checks.first(~((residual <= limit * squared.detach().amax(-1)) & (orthogonality <= limit)))
     if where is not None:
