@@ -11,7 +11,6 @@ take alone.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -249,56 +248,34 @@ def _rows(chain: Chain, state: State, composition: Composition, step: Tensor | f
     """The compiled loop: float32 or float64 on the CPU, no gradient."""
     from torchchain.evolvers.symplectic_kernel import advance_rows
 
-    hertz, damped, periodic = chain.contact == "hertz", chain.is_damped, chain.boundary == "periodic"
-    n, lead = chain.n_particles, state.displacement.shape[:-1]
-    with torch.no_grad():
-        dtype = chain.masses.dtype
-        displacement, velocity = (
-            x.reshape(-1, n).clone(memory_format=torch.contiguous_format) for x in (state.displacement, state.velocity)
-        )
-        peak = torch.full((len(displacement), n + 1), -math.inf, dtype=dtype)
-        lost = torch.zeros(len(displacement), dtype=dtype)
-        weight = (1 / chain.masses).reshape(-1, n).contiguous()
-        stiffness, damping = (
-            chain.in_a_row(values).reshape(-1, n + 1).contiguous()
-            for values in (chain.contact_stiffness, chain.contact_damping)
-        )
-        opening, closing = (torch.tensor(pair, dtype=dtype) for pair in (composition.opening, composition.closing))
-        middle = torch.tensor(composition.middle, dtype=dtype).reshape(-1, 2)
-        longest = torch.as_tensor(step, dtype=torch.float64).expand(lead).reshape(-1)
+    hertz, damped, n, lead = chain.contact == "hertz", chain.is_damped, chain.n_particles, state.displacement.shape[:-1]
+    kind = np.float32 if chain.masses.dtype == torch.float32 else np.float64
+
+    def of_chains(values: Tensor) -> np.ndarray:
+        return values.detach().reshape(-1, values.shape[-1]).contiguous().numpy()
+
+    moving = [x.detach().reshape(-1, n).numpy().copy() for x in (state.displacement, state.velocity)]
+    rows = len(moving[0])
+    numbers = (
+        *moving, np.full((rows, n + 1), -np.inf, kind), np.zeros(rows, kind), of_chains(1 / chain.masses),
+        *(of_chains(chain.in_a_row(values)) for values in (chain.contact_stiffness, chain.contact_damping)),
+        chain.is_free, hertz, damped, np.array(composition.opening, kind), np.array(composition.middle, kind).reshape(-1, 2),
+        np.array(composition.closing, kind),
+    )  # fmt: skip
+    longest = torch.as_tensor(step, dtype=torch.float64).expand(lead).reshape(-1)
     now = 0.0
 
     def advance(times: Tensor) -> Trajectory:
         nonlocal now
         targets = targets_of(times, now)
         counts = substeps(now, targets, longest)
-        steps = torch.from_numpy(np.diff(targets, prepend=now) / np.maximum(counts, 1)).to(dtype)
-        rows, window = len(displacement), len(targets)
-        out = [torch.empty(rows, window, n, dtype=dtype) for _ in range(2)]
-        losses = torch.empty(rows, window, dtype=dtype)
-        openings = torch.zeros(rows, window, dtype=torch.int64)
-        arrays = [
-            tensor.detach().numpy() for tensor in (displacement, velocity, peak, lost, weight, stiffness, damping)
-        ]
-        advance_rows(
-            *arrays,
-            periodic,
-            hertz,
-            damped,
-            *(tensor.numpy() for tensor in (opening, middle, closing)),
-            counts,
-            *(tensor.numpy() for tensor in (steps, *out)),
-            losses.numpy(),
-            openings.numpy(),
-        )
+        steps = (np.diff(targets, prepend=now) / np.maximum(counts, 1)).astype(kind)
+        window = len(targets)
+        out, losses, openings = np.empty((2, rows, window, n), kind), np.empty_like(steps), np.zeros_like(counts)
+        advance_rows(*numbers, counts, steps, *out, losses, openings)
         now = targets[-1]
-        series = [part.reshape(*lead, window, n) for part in out]
-        return Trajectory(
-            times,
-            series[0],
-            series[1],
-            losses.reshape(*lead, window) if damped else None,
-            openings.reshape(*lead, window) if hertz else None,
-        )
+        displacement, velocity = torch.from_numpy(out).reshape(2, *lead, window, n)
+        lost, opened = (torch.from_numpy(values).reshape(*lead, window) for values in (losses, openings))
+        return Trajectory(times, displacement, velocity, lost if damped else None, opened if hertz else None)
 
     return advance
