@@ -7,12 +7,14 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from torchchain import checks
 from torchchain.frames.doubts import warn
 from torchchain.frames.formats import FORMATS
+from torchchain.frames.passes import where
 from torchchain.frames.record import AXES
 from torchchain.frames.registry import Entry, Format
 from torchchain.frames.text import Text, readable
@@ -136,24 +138,14 @@ def time_of(entry: Entry, options: dict[str, Any]) -> float | None:
 
 def _check_times(places: list[Place], options: dict[str, Any]) -> None:
     """An error for frames out of order."""
-    before: Place | None = None
-    for place in places:
-        if before is not None:
-            for field in ("step", "time"):
-                a, b = getattr(before.entry, field), getattr(place.entry, field)
-                if (a is None) != (b is None):
-                    raise checks.fail(
-                        f"{place.file.path.name}, frame {place.entry.number}: {field}",
-                        "be given in all frames or in none",
-                        b,
-                    )
-                if a is not None and b <= a:
-                    raise checks.fail(
-                        f"{place.file.path.name}, frame {place.entry.number}: {field}",
-                        "be later than in the frame before",
-                        f"{b:.10g} after {a:.10g}",
-                    )
-        before = place
+    for before, place in pairwise(places):
+        for field in ("step", "time"):
+            a, b = getattr(before.entry, field), getattr(place.entry, field)
+            at = f"{where(place.file.path.name, place.entry.number)}: {field}"
+            if (a is None) != (b is None):
+                raise checks.fail(at, "be given in all frames or in none", b)
+            if a is not None and b <= a:
+                raise checks.fail(at, "be later than in the frame before", f"{b:.10g} after {a:.10g}")
     if options.get("time_step") is not None and places[0].entry.time is not None:
         raise checks.fail(
             "time_step", f"be left out, as {places[0].file.path.name} states its times", options["time_step"]
@@ -173,7 +165,7 @@ def _with_contacts(places: list[Place], files: list[Path], options: dict[str, An
         for entry in scan.entries:
             key = getattr(entry, kind)
             if key in by:
-                raise checks.fail(f"{path.name}, frame {entry.number}: {kind}", "be another than before", key)
+                raise checks.fail(f"{where(path.name, entry.number)}: {kind}", "be another than before", key)
             by[key] = (file, entry)
     if getattr(places[0].entry, kind) is None:
         raise checks.fail(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import scipy
@@ -205,12 +206,10 @@ def rigid_motions(network: Network) -> int:
     x = x - x.mean(0)
     size = np.abs(x).max() or 1.0
     motions = []
-    for a in range(d):
-        for b in range(a + 1, d):
-            if is_open[a] and is_open[b]:
-                turn = np.zeros((n, d))
-                turn[:, a], turn[:, b] = x[:, b] / size, -x[:, a] / size
-                motions.append(turn.reshape(-1))
+    for a, b in combinations([a for a in range(d) if is_open[a]], 2):
+        turn = np.zeros((n, d))
+        turn[:, a], turn[:, b] = x[:, b] / size, -x[:, a] / size
+        motions.append(turn.reshape(-1))
     return d + (int(np.linalg.matrix_rank(np.stack(motions), tol=1e-9 * n**0.5)) if motions else 0)
 
 

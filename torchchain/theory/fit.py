@@ -105,7 +105,7 @@ def fit_disorder(
     mean, variance = data.mean(0), _pooled(data.var(0, ddof=1) / len(data), curve, shape, found, n_particles)
 
     @cache
-    def at(*parameters: float) -> tuple[np.ndarray, np.ndarray]:
+    def model(*parameters: float) -> tuple[np.ndarray, np.ndarray]:
         strength = min(max(math.exp(parameters[0]), WEAKEST), STRONGEST)
         damping = parameters[1] if fit_damping else 0.0
         result = theory_transfer(
@@ -117,9 +117,6 @@ def fit_disorder(
         error = result.systematic[..., None] * (2.0 / n_bands)
         return result.mean.numpy().ravel(), error.expand_as(result.mean).numpy().ravel()
 
-    def model(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return at(*parameters.tolist())
-
     first = np.array([math.log(start)] + [0.01] * fit_damping)
     bounds = (
         np.array([math.log(WEAKEST)] + [0.0] * fit_damping),
@@ -127,24 +124,24 @@ def fit_disorder(
     )
     parameters = first
     for _ in range(2):  # the weights follow the systematic error at the estimate
-        _, systematic = model(parameters)
+        _, systematic = model(*parameters)
         weight = 1 / np.sqrt(variance + systematic**2 + 1e-10)
         solution = scipy.optimize.least_squares(
-            lambda p, weight=weight: (model(p)[0] - mean) * weight,
+            lambda p, weight=weight: (model(*p)[0] - mean) * weight,
             parameters, bounds=bounds, diff_step=_STEP, xtol=3e-4, ftol=1e-5, max_nfev=12, x_scale=np.array([1.0, 0.1])[: len(first)],
         )  # fmt: skip
         parameters = solution.x
     gain = np.linalg.pinv(solution.jac) * weight  # estimate's change with the data, (parameter, datum)
     influence = (data - mean) @ gain.T
     noise = (influence**2).sum(0) / (len(data) * (len(data) - 1))
-    _, systematic = model(parameters)
+    _, systematic = model(*parameters)
     # Systematic errors at different times and bands do not all have one sign: as if a tenth of them were independent.
     bias = 10 * (gain**2 @ systematic**2)
     error = np.sqrt(noise + bias)
     strength = math.exp(parameters[0])
     misfit = math.sqrt(float((solution.fun**2).mean()))
     damped = (float(parameters[1]), float(error[1])) if fit_damping else (0.0, 0.0)
-    return DisorderFit(strength, strength * float(error[0]), *damped, misfit, at.cache_info().misses)
+    return DisorderFit(strength, strength * float(error[0]), *damped, misfit, model.cache_info().misses)
 
 
 def _pooled(
