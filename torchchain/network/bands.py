@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -279,9 +280,8 @@ def band_waves(
     displacement = torch.stack([wave.displacement for wave in waves], dim=-3)
     each = torch.stack([way for way, _ in ways])
     lengths = zone(network).lengths
-    strides = [math.prod(network.shape[a + 1 :]) for a in range(len(network.shape))]
-    where = (each * torch.tensor(strides)).sum(-1)
-    return BandWaves(State(displacement, torch.zeros_like(displacement)), each, lengths[where.to(lengths.device)])
+    where = np.ravel_multi_index(tuple(each.T.numpy()), network.shape)
+    return BandWaves(State(displacement, torch.zeros_like(displacement)), each, lengths[torch.from_numpy(where)])
 
 
 def long_time_band_energy(

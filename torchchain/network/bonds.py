@@ -58,6 +58,11 @@ def checked_bonds(
     return bonds, images
 
 
+def moved(images: Tensor, box: Tensor) -> Tensor:
+    """How far copies in the cells ``images`` (*any, dimension) are from their particles, (*any, dimension)."""
+    return torch.where(images == 0, 0.0, images * box) if box.ndim == 1 else images.to(box) @ box
+
+
 def check_shorter_than_half(lengths: Tensor, box: Tensor) -> None:
     """An error for bonds (bond,) not shorter than half of the smallest distance of opposite faces of the periodic cell."""
     width = box.min().item() if box.ndim == 1 else 1 / torch.linalg.inv(box).norm(dim=0).max().item()

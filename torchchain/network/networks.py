@@ -123,9 +123,7 @@ class Network:
             return vectors
         if self.images is None:
             return self.nearest_image(vectors)
-        if self.box.ndim == 1:
-            return vectors + torch.where(self.images == 0, 0.0, self.images * self.box)
-        return vectors + self.images.to(self.box) @ self.box
+        return vectors + bonds.moved(self.images, self.box)
 
     def _per_bond(self, name: str, value: float | Tensor, signed: bool) -> Tensor:
         value = checks.real_tensor(name, value).to(self.masses)

@@ -12,6 +12,7 @@ from torchchain import checks
 from torchchain.chain import State
 from torchchain.evolvers.method import Advance, Method, targets_of
 from torchchain.evolvers.symplectic import check_limits, substeps
+from torchchain.network.bonds import moved
 from torchchain.network.modes import check_stability
 from torchchain.network.networks import Network
 from torchchain.network.packings import Packing, contact_law, near_pairs
@@ -97,7 +98,6 @@ def _grains(network: Packing, state: State, step: float) -> Advance:
             "state", "be on the CPU for grains (linear=True: the network's linear motion)", "another device"
         )
     shape, dtype = state.displacement.shape, state.displacement.dtype
-    d = network.dimension
     damping = torch.as_tensor(network.damping)
     if damping.numel() and bool((damping != damping.flatten()[0]).any()):
         raise checks.fail("damping", "be one number for grains, whose contacts change", "several")
@@ -116,11 +116,8 @@ def _grains(network: Packing, state: State, step: float) -> Advance:
 
     def lists(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         pairs, images = near_pairs(torch.from_numpy(x), network.radii, network.box, skin)
-        shifts = np.zeros((len(pairs), d))
-        if network.box is not None:
-            box = network.box.double()
-            shifts = (torch.where(images == 0, 0.0, images * box) if box.ndim == 1 else images.double() @ box).numpy()
-        return pairs.numpy(), np.ascontiguousarray(shifts)
+        shifts = images.double() if network.box is None else moved(images, network.box.double())
+        return pairs.numpy(), np.ascontiguousarray(shifts.numpy())
 
     listed = [(x.copy(), *lists(x)) for x, _ in rows]
 
