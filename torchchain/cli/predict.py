@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 PREDICT_KEYS = ("strength", "source", "initial", "times", "excitation", "state")
 STARTS = ("source", "initial", "excitation", "state")
+Start = torch.Tensor | StartEnergy
+"""What is solved for: energies of bands (start, band), or starts in space with that axis."""
 
 
 def run_predict(flags: Predict, arguments: list[str]) -> None:
@@ -50,7 +52,12 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
         times = _times(given.get("times", {}))
         starts, labels, request = _starts(given, master)
         with stages("prediction"):
-            energy = master.solve(starts.given, times, method=flags.method).detach().cpu()
+            energy = master.solve(starts, times, method=flags.method).detach().cpu()
+        if isinstance(starts, torch.Tensor):
+            bands, rest, gone = starts, torch.zeros(1), torch.zeros(len(labels), len(times))
+        else:
+            assert master.starts is not None, "or such starts are refused"
+            bands, rest, gone = starts.bands(master.n_bands), starts.rigid, master.starts.lost(starts, times).cpu()
         data = _dataset(master, path, starts, labels, times, energy)
         if "strength" in given:
             request["strength"] = float(given["strength"])
@@ -58,7 +65,7 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
             request["plugins"] = loaded
         text = tomli_w.dumps({**request, "times": times.tolist()})
         count = f"{len(labels)} start{'s' * (len(labels) > 1)}"
-        drawn = outputs.figures(_figure(starts, labels, times, energy), flags.format)
+        drawn = outputs.figures(_figure(bands, labels, times, energy), flags.format)
         outputs.leave(
             out, {"results.nc": outputs.dataset(data), **drawn}, arguments, text, device, began, stages.seconds,
             seed=flags.seed, method=flags.method, warnings=warned, model={"path": str(path.resolve()), "sha256": digest},
@@ -66,11 +73,10 @@ def run_predict(flags: Predict, arguments: list[str]) -> None:
             reasons=[f"solved by {flags.method}", *repr(master).splitlines()[1:]],
         )  # fmt: skip
     print(f"{count}, {len(times)} times to {float(times[-1]):g}, solved by {flags.method}")
-    gone = starts.gone(master, times)
-    change = float((energy.sum(-1) + gone - starts.bands.sum(-1)[:, None]).abs().max())
+    change = float((energy.sum(-1) + gone - bands.sum(-1)[:, None]).abs().max())
     print(f"largest change of total energy: {change:.3g}")
-    if bool(starts.rest.any()):
-        print(f"energy at k = 0, which stays there and is in no band: {float(starts.rest.max()):.3g}")
+    if bool(rest.any()):
+        print(f"energy at k = 0, which stays there and is in no band: {float(rest.max()):.3g}")
     if bool(gone.any()):
         print(f"energy that goes there from kicks: up to {float(gone.max()):.3g}")
     print(f"lowest energy in a band: {float(energy.min()):.3g}")
@@ -95,47 +101,25 @@ def _times(times: Any) -> torch.Tensor:
     return regular_times(**{**TIMES, **times})
 
 
-@dataclass(frozen=True, eq=False)
-class Starts:
-    """What is solved for: energies of bands (start, band), or starts in space with that axis; and what is drawn of it."""
-
-    given: torch.Tensor | StartEnergy
-    bands: torch.Tensor
-    rest: torch.Tensor
-
-    @classmethod
-    def of(cls, given: torch.Tensor | StartEnergy, n_bands: int) -> Starts:
-        if isinstance(given, StartEnergy):
-            return cls(given, given.bands(n_bands), given.rigid)
-        return cls(given, given, torch.zeros(len(given)))
-
-    def gone(self, master: MasterEquation, times: torch.Tensor) -> torch.Tensor:
-        """Energy that goes to k = 0, (start, time)."""
-        if master.starts is None or not isinstance(self.given, StartEnergy):
-            return torch.zeros(len(self.bands), len(times))
-        return master.starts.lost(self.given, times).cpu()
-
-
-def _starts(given: Mapping[str, Any], master: MasterEquation) -> tuple[Starts, list[str], dict[str, Any]]:
+def _starts(given: Mapping[str, Any], master: MasterEquation) -> tuple[Start, list[str], dict[str, Any]]:
     """What is solved for, the names of the starts, and what was asked for."""
     n_bands, named = master.n_bands, [name for name in STARTS if name in given]
     if len(named) > 1:
         raise checks.fail(named[0], f"not be given together with {named[1]}", checks.shown(given[named[0]]))
     if named and named[0] in ("excitation", "state"):
-        start, labels, request = _in_space(named[0], given[named[0]], master)
-        return Starts.of(start, n_bands), labels, request
+        return _in_space(named[0], given[named[0]], master)
     if "initial" in given:
         initial = checks.real_tensor("initial", given["initial"])
         if tuple(initial.shape) != (n_bands,):
             raise checks.fail("initial", f"hold the {n_bands} bands of the model", f"{initial.numel()} numbers")
         checks.first_bad("initial", "not be negative", initial, initial < 0, "band")
-        return Starts.of(initial[None], n_bands), ["initial"], {"initial": initial.tolist()}
+        return initial[None], ["initial"], {"initial": initial.tolist()}
     source = given.get("source", range(1, n_bands + 1))
     if isinstance(source, (str, Mapping, int)) or not len(source):
         raise checks.FieldTypeError(f"source must be a list of bands, got {checks.shown(source)}")
     bands = [checks.integer("source", s, 1, n_bands) for s in source]
     starts = torch.eye(n_bands, dtype=torch.float64)[[s - 1 for s in bands]]
-    return Starts.of(starts, n_bands), [str(s) for s in bands], {"source": bands}
+    return starts, [str(s) for s in bands], {"source": bands}
 
 
 def _in_space(field: str, table: Any, master: MasterEquation) -> tuple[StartEnergy, list[str], dict[str, Any]]:
@@ -168,7 +152,7 @@ def _in_space(field: str, table: Any, master: MasterEquation) -> tuple[StartEner
 def _dataset(
     master: MasterEquation,
     path: Path,
-    starts: Starts,
+    starts: Start,
     labels: list[str],
     times: torch.Tensor,
     energy: torch.Tensor,
@@ -182,7 +166,7 @@ def _dataset(
     origin = "" if told is None else told.provenance if told.scene is None else told.scene.to_toml()
     variables = {"band_energy": (axes, energy.numpy(), {**units, "long_name": "energy in a band"})}
     if master.uncertainty is not None:
-        error = master.standard_error(starts.given, times).cpu().numpy()
+        error = master.standard_error(starts, times).cpu().numpy()
         label = {**units, "long_name": "standard error of the energy in a band"}
         variables["band_energy_stderr"] = (axes, error, label)
     return xarray.Dataset(
@@ -196,12 +180,12 @@ def _dataset(
     )
 
 
-def _figure(starts: Starts, labels: list[str], times: torch.Tensor, energy: torch.Tensor) -> Any:
+def _figure(bands: torch.Tensor, labels: list[str], times: torch.Tensor, energy: torch.Tensor) -> Any:
     shown = [0] if len(labels) == 1 else [round((len(labels) - 1) * f) for f in (10 / 32, 23 / 32)]
     with plots.style():
         figure, axes = plots.figure(plots.COLUMN * len(shown), 2.7, 1, len(shown))
         for ax, index in zip(axes[0], shown, strict=True):
-            total = float(starts.bands[index].sum()) or 1.0
+            total = float(bands[index].sum()) or 1.0
             plots.band_map(ax, times.numpy(), energy[index].numpy() / total, f"start: {labels[index]}")
         plots.lettered(axes.flat if len(shown) > 1 else ())
     return figure
