@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchchain import checks
+from torchchain.chain.disorder import Disorder
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.theory.fit import DisorderFit, fit_disorder
 
@@ -48,9 +49,8 @@ def estimate_disorder(
         if scene is None:
             raise checks.fail("n_particles", "be given for a transfer without a scene", "None")
         n_particles = scene.n_particles
-    law = scene.disorder if scene is not None else None
+    law = Disorder() if scene is None else scene.disorder
     return fit_disorder(
         transfer.times, transfer.block_mean, n_particles, transfer.n_bands, None if scene is None else scene.tones,
-        kind if kind is not None else (law.kind if law is not None else "normal"),
-        lower if lower is not None else (law.lower if law is not None else 0.05), damping, guess,
+        law.kind if kind is None else kind, law.lower if lower is None else lower, damping, guess,
     )  # fmt: skip
