@@ -269,12 +269,10 @@ def _regression(sample: Sample, degrees: Degrees) -> tuple[Regression, TheoryMod
     start = TheoryModel.of(sample.chains, degrees, torch.zeros(size_of(degrees), dtype=torch.float64))
     times, data, weight = fit_points(sample.times, sample.mean, sample.long_time, sample.distance)
     smooth = smooth_of(degrees)
-    found = Regression.of_odds(
-        derived(start.ring, times), shapes(start.ring.distances, smooth), smooth, times, data, weight
-    )
-    if len(degrees) == 5:
-        found = RingingRegression.added(found, Ringing.of(start.ring, *degrees[3:]), times)
-    return found, start
+    given = derived(start.ring, times), shapes(start.ring.distances, smooth), smooth, times, data, weight
+    if len(degrees) == 3:
+        return Regression.of_odds(*given), start
+    return RingingRegression.of_odds(*given, ringing=Ringing.of(start.ring, *degrees[3:]), when=times), start
 
 
 def _correct(sample: Sample, recipe: Recipe, near: TransferModel | None, progress: Progress) -> Fitted:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -65,16 +65,18 @@ class Regression:
     @classmethod
     def of_odds(
         cls, odds: Tensor, parts: tuple[Tensor, Tensor], degrees: tuple[int, int, int], times: Tensor, data: Tensor,
-        weight: np.ndarray,
-    ) -> Regression:  # fmt: skip
-        """From first odds [source, time, receiver] and the polynomials of pairs and of the own band, as of ``shapes``."""
+        weight: np.ndarray, **more: Any,
+    ) -> Self:  # fmt: skip
+        """From first odds [source, time, receiver] and the polynomials of pairs and of the own band, as of ``shapes``.
+
+        ``more`` is what a class of regressions knows beyond them.
+        """
         first, own = parts
         eye = torch.eye(len(odds), dtype=torch.float64)
         shape = torch.cat([first * (1 - eye)[..., None], own * eye[..., None]], dim=-1)
         clock = polynomials(clock_of(times), degrees[2])
-        return cls(
-            odds.numpy(), shape.numpy(), clock.numpy(), degrees, data.numpy(), np.broadcast_to(weight, data.shape[:2])
-        )
+        weight = np.broadcast_to(weight, data.shape[:2])
+        return cls(odds.numpy(), shape.numpy(), clock.numpy(), degrees, data.numpy(), weight, **more)
 
     @property
     def held(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -102,31 +102,17 @@ class Ringing:
         one = torch.einsum("fst,si,fij,rj->str", beats, place, table, place)
         return (one + one.transpose(0, 2)).clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT)
 
-    def slopes(self, times: Tensor) -> _Slopes:
-        """Of the exponent by its coefficients."""
+    def slopes(self, times: Tensor) -> Iterator[np.ndarray]:
+        """Of the exponent by its coefficients, [source, receiver, term], at one time after the other.
+
+        Of all at once there would be hundreds of megabytes.
+        """
         beats, place = (each.numpy() for each in self._beats(times))
-        i, j = (np.array(each) for each in zip(*products(self.degree), strict=True))
-        return _Slopes(beats, place[:, i], place[:, j])
-
-
-@dataclass(frozen=True, eq=False)
-class _Slopes:
-    """Of the exponent, one time at a time: of all at once there would be hundreds of megabytes.
-
-    Attributes:
-        beats: (beat, band, time).
-        own, other: polynomials of either place for each product, (band, product).
-    """
-
-    beats: np.ndarray
-    own: np.ndarray
-    other: np.ndarray
-
-    def at(self, time: int) -> np.ndarray:
-        """[source, receiver, term]."""
-        parts = self.beats[:, :, time].T[:, :, None] * self.own[:, None]  # (source, beat, product)
-        found = (parts[:, None] * self.other[:, None]).reshape(len(self.own), len(self.own), -1)
-        return found + found.transpose(1, 0, 2)
+        own, other = (place[:, list(each)] for each in zip(*products(self.degree), strict=True))
+        for beat in beats.transpose(2, 1, 0):
+            parts = beat[:, :, None] * own[:, None]  # (source, beat, product)
+            found = (parts[:, None] * other[:, None]).reshape(len(own), len(own), -1)
+            yield found + found.transpose(1, 0, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,16 +121,11 @@ class RingingRegression(Regression):
 
     Attributes:
         ringing: see :class:`Ringing`.
-        times: of the data, some of which may be infinite, (time,).
+        when: times of the data, some of which may be infinite, (time,).
     """
 
     ringing: Ringing
-    times: Tensor
-
-    @classmethod
-    def added(cls, plain: Regression, ringing: Ringing, times: Tensor) -> RingingRegression:
-        """To a regression of the same data."""
-        return cls(**{entry.name: getattr(plain, entry.name) for entry in fields(plain)}, ringing=ringing, times=times)
+    when: Tensor
 
     @property
     def size(self) -> int:
@@ -156,7 +137,7 @@ class RingingRegression(Regression):
     def predicted(self, coefficients: np.ndarray) -> np.ndarray:
         first = super().size
         smooth = self.shape @ (super().table(coefficients[:first]) @ self.clock.T)
-        rings = self.ringing.exponent(self.times, torch.from_numpy(coefficients[first:])).numpy()
+        rings = self.ringing.exponent(self.when, torch.from_numpy(coefficients[first:])).numpy()
         moved = self.odds * np.exp(np.clip(smooth, -LARGEST_EXPONENT, LARGEST_EXPONENT).transpose(0, 2, 1) + rings)
         return moved / moved.sum(-1, keepdims=True)
 
@@ -177,9 +158,8 @@ class RingingRegression(Regression):
     def _slopes(self, found: np.ndarray) -> Iterator[np.ndarray]:
         """Derivatives of T by the coefficients, over its error, (source receiver, term), of one time after the other."""
         rows, columns = np.nonzero(self.held)
-        rings = self.ringing.slopes(self.times)
-        for i, clock in enumerate(self.clock):
-            exponent = np.concatenate([self.shape[..., rows] * clock[columns], rings.at(i)], axis=-1)
+        for i, (clock, rings) in enumerate(zip(self.clock, self.ringing.slopes(self.when), strict=True)):
+            exponent = np.concatenate([self.shape[..., rows] * clock[columns], rings], axis=-1)
             mean = np.matmul(found[:, None, i], exponent)
             slope = (exponent - mean) * (found[:, i] * self.weight[:, i, None])[..., None]
             yield slope.reshape(-1, exponent.shape[-1])
