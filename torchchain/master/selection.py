@@ -121,21 +121,13 @@ def _tried(
     halves: Halves, batch: Sequence[Recipe], trials: Sequence[Trial], workers: int
 ) -> list[Trial | checks.FieldError]:
     """The rungs of a batch in their order; those of different kinds side by side."""
-    kinds: dict[type, list[int]] = {}
-    for place, candidate in enumerate(batch):
-        kinds.setdefault(record_of(candidate).kind, []).append(place)
-    known = [trial.model for trial in trials]
+    kinds, known = list(dict.fromkeys(record_of(rung).kind for rung in batch)), [trial.model for trial in trials]
 
-    def climb(places: list[int]) -> list[Trial | checks.FieldError]:
-        return halves.climb([batch[place] for place in places], known)
+    def climb(kind: type) -> list[Trial | checks.FieldError]:
+        return halves.climb([rung for rung in batch if record_of(rung).kind is kind], known)
 
-    found = map_in_order(climb, kinds.values(), min(workers, len(kinds)))
-    by_place = {
-        place: each
-        for places, part in zip(kinds.values(), found, strict=True)
-        for place, each in zip(places, part, strict=True)
-    }
-    return [by_place[place] for place in range(len(batch))]
+    found = dict(zip(kinds, map(iter, map_in_order(climb, kinds, min(workers, len(kinds)))), strict=True))
+    return [next(found[record_of(rung).kind]) for rung in batch]
 
 
 def _best(trials: Sequence[Trial]) -> tuple[Trial, str]:
