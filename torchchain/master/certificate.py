@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchchain import checks
-from torchchain.master.memory import MemoryModel
+from torchchain.master.memory import MemoryModel, poles_of
 from torchchain.master.model import TransferModel
 from torchchain.master.proof import ROUNDING, Certificate
 
@@ -62,7 +62,7 @@ class Exponentials:
         amplitudes = model.amplitudes.detach().double().cpu().numpy().reshape(len(model.amplitudes), -1)
         pairs = amplitudes[single::2] - 1j * amplitudes[single + 1 :: 2]
         weight = np.concatenate([amplitudes[:single] + 0j, pairs])
-        return cls(model.basis.double().cpu().numpy().ravel(), weight, model.poles.exponents)
+        return cls(model.basis.double().cpu().numpy().ravel(), weight, poles_of(model).exponents)
 
     @classmethod
     def of_embedding(cls, model: TransferModel) -> Exponentials:

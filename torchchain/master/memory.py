@@ -109,12 +109,6 @@ class MemoryModel(TransferModel):
         return kept + self.amplitudes[1:].numel() + len(self.decay) + 2 * len(self.pair_decay)
 
     @property
-    def poles(self) -> Poles:
-        """Decay rates and frequencies, in double precision."""
-        every = (self.decay, self.pair_decay, self.pair_frequency)
-        return Poles(*(value.detach().double().cpu().numpy() for value in every))
-
-    @property
     def order(self) -> Order:
         """Numbers of exponentials and of pairs."""
         return len(self.decay), len(self.pair_decay)
@@ -238,7 +232,7 @@ def fit_memory(
     at_zero = (torch.eye(len(basis), dtype=basis.dtype) - basis).flatten().numpy()
     leading = leading_vectors(data) if leading is None else leading
     small = Projection(times.numpy(), data @ leading, at_zero @ leading)
-    poles, ended = search(small, order, None if near is None else near.poles, progress)
+    poles, ended = search(small, order, None if near is None else poles_of(near), progress)
     amplitudes, misfit, _ = Projection(times.numpy(), data, at_zero).amplitudes(poles)
     report = ProjectionReport(ended, float(np.sqrt(np.mean(misfit**2))), order)
     return packed(basis, poles, amplitudes, _conserved(mean, basis)), report
@@ -247,6 +241,12 @@ def fit_memory(
 def _conserved(mean: Tensor, basis: Tensor) -> bool:
     """Whether the energies sum to what stays at every time; amplitudes sum to zero then, but for rounding."""
     return float((mean.sum(-1) - basis.sum(-1)[:, None]).abs().max()) < 1e-9
+
+
+def poles_of(model: MemoryModel) -> Poles:
+    """Decay rates and frequencies, in double precision."""
+    every = (model.decay, model.pair_decay, model.pair_frequency)
+    return Poles(*(value.detach().double().cpu().numpy() for value in every))
 
 
 def packed(basis: Tensor, poles: Poles, amplitudes: np.ndarray, conserved: bool = False) -> dict[str, Tensor]:
@@ -284,7 +284,7 @@ def replicas(transfer: BandTransfer, recipe: Recipe, model: MemoryModel, repeats
     block is reduced once, and each replica is fitted to a sum of rows.
     """
     sample, n = Sample.of(transfer), transfer.n_bands
-    poles = model.poles
+    poles = poles_of(model)
     times = sample.times.numpy()
     wanted = np.concatenate([poles.functions(times), poles.slopes(times), np.ones((len(times), 1))], axis=1)
     rows, _ = np.linalg.qr(wanted / np.linalg.norm(wanted, axis=0))

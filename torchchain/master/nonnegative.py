@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchchain import checks
 from torchchain.master.certificate import CertificateError, Exponentials, certify, proof_edges
-from torchchain.master.memory import MemoryModel, packed
+from torchchain.master.memory import MemoryModel, packed, poles_of
 from torchchain.master.projection import Poles
 from torchchain.master.proof import Certificate
 
@@ -118,7 +118,7 @@ def nonnegative(
     grid, weight = np.concatenate([times.numpy(), beyond]), np.concatenate([weight, np.full(16, LATER * weight[-1])])
     rest = torch.cat([mean - basis[:, None], torch.zeros(len(basis), 16, len(basis), dtype=basis.dtype)], dim=1).numpy()
     slowest = SLOWEST / float(times[-1])
-    poles, early = model.poles, np.array(EARLY_PAIRS)
+    poles, early = poles_of(model), np.array(EARLY_PAIRS)
     poles = Poles(
         np.concatenate([np.maximum(poles.decay, slowest), EARLY_DECAY]),
         np.concatenate([np.maximum(poles.pair_decay, slowest), early[:, 0]]),

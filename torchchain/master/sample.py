@@ -102,12 +102,12 @@ class Sample:
         return leading_vectors(self.residual(kept))
 
 
-def leading_vectors(data: np.ndarray, count: int = LEADING) -> np.ndarray:
+def leading_vectors(data: np.ndarray) -> np.ndarray:
     """Leading right singular vectors, (column, vector), by two power iterations on a random range.
 
     (Halko, Martinsson and Tropp, SIAM Rev. 53, 217, 2011; the same random numbers every time.)
     """
-    count = min(count, *data.shape)
+    count = min(LEADING, *data.shape)
     random = np.random.Generator(np.random.Philox(key=np.array([count, 0], dtype=np.uint64)))
     vectors = random.normal(size=(data.shape[1], min(count + 16, *data.shape)))
     for _ in range(3):
