@@ -53,6 +53,13 @@ def test_only_common_times_are_compared(results):
     assert found.n_values == later["band_energy"].size
 
 
+def test_rounding_is_no_error(results):
+    one = results[0].assign(band_energy_stderr=0 * results[0].band_energy + 1e-18)
+    (found,) = compare(one, one.assign(band_energy=one.band_energy + 1e-15))
+    assert found.largest_difference > 0
+    assert math.isnan(found.rms_z)
+
+
 def test_results_without_errors(results):
     bare = results[0].drop_vars("band_energy_stderr")
     (found,) = compare(bare, bare)

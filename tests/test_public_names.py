@@ -106,6 +106,7 @@ reveal_type(tc.open("results").transfer)
 reveal_type(tc.localization.lyapunov_exponent)
 tc.Scene(particles=3)
 tc.nothing
+raise tc.TrustWarning
 """
 
 
@@ -132,3 +133,4 @@ def test_a_type_checker_knows_what_a_name_is(tmp_path):
         assert name in kind
     assert "Unexpected keyword argument" in report
     assert 'Module has no attribute "nothing"' in report
+    assert "TrustWarning" not in report, "an earlier name is one"

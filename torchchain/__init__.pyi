@@ -83,7 +83,7 @@ from torchchain.master import chapman_kolmogorov as chapman_kolmogorov
 from torchchain.master import implied_timescales as implied_timescales
 from torchchain.master import paper_rates as paper_rates
 from torchchain.master import register_model as register_model
-from torchchain.master.equation import PredictionWarning as TrustWarning  # noqa: F401 (its earlier name)
+from torchchain.master.equation import TrustWarning as TrustWarning
 from torchchain.master.stand_in import plan as plan
 from torchchain.modes import DecompositionError as DecompositionError
 from torchchain.modes import NormalModes as NormalModes

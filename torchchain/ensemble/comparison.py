@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import xarray
 
 BAND_AXES = ("band", "receiver")
+ROUNDING = 1e-14
+"""Errors up to this share of the largest value are rounding, not chance: such values have no error."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,9 @@ def _difference(a: xarray.Dataset, b: xarray.Dataset, variable: str) -> tuple[xa
     first, second = xarray.align(_with_error(a, variable), _with_error(b, variable), join="inner")
     if first["value"].size == 0:
         raise checks.fail(f"{variable} of both results", "have coordinates in common", "none")
-    return first["value"] - second["value"], (first["error"] ** 2 + second["error"] ** 2) ** 0.5
+    error = (first["error"] ** 2 + second["error"] ** 2) ** 0.5
+    scale = max(float(abs(each["value"]).max()) for each in (first, second))
+    return first["value"] - second["value"], error.where(~(error <= ROUNDING * scale), 0.0)
 
 
 def _with_error(data: xarray.Dataset, variable: str) -> xarray.Dataset:

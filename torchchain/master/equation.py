@@ -56,6 +56,10 @@ class PredictionWarning(UserWarning):
     """
 
 
+TrustWarning = PredictionWarning
+"""Its earlier name."""
+
+
 class MasterEquation(Printed, nn.Module):
     """Predicts the energy in every band at any later time, from any start over the bands.
 
