@@ -67,32 +67,28 @@ class AdamReport:
     penalty: float
 
 
-class ConstrainedRates(nn.Module):
-    """Q with no negative rate between bands and rows that sum to zero, whatever its parameter."""
+class Rates(nn.Module):
+    """Q from a parameter in units of its typical size: itself, or none negative between bands and rows that sum to zero.
 
-    def __init__(self, rates: Tensor) -> None:
+    Args:
+        rates: to start from, [source, receiver].
+        exact: which of the two.
+    """
+
+    def __init__(self, rates: Tensor, exact: bool) -> None:
         super().__init__()
         off = rates - torch.diag(rates.diagonal())
-        self.scale = off.abs().mean().clamp(min=1e-12)
-        off = (off / self.scale).clamp(min=1e-3)
-        self.raw = nn.Parameter(off + torch.log(-torch.expm1(-off)))  # the inverse of softplus
+        self.exact, self.scale = exact, off.abs().mean().clamp(min=1e-12)
+        positive = (off / self.scale).clamp(min=1e-3)
+        softened = positive + torch.log(-torch.expm1(-positive))  # the inverse of softplus
+        self.raw = nn.Parameter(softened if exact else rates / self.scale)
 
     def forward(self) -> Tensor:
+        if not self.exact:
+            return self.raw * self.scale
         off = nn.functional.softplus(self.raw) * self.scale
         off = off - torch.diag(off.diagonal())
         return off - torch.diag(off.sum(-1))
-
-
-class FreeRates(nn.Module):
-    """Q itself, in units of its typical size."""
-
-    def __init__(self, rates: Tensor) -> None:
-        super().__init__()
-        self.scale = (rates - torch.diag(rates.diagonal())).abs().mean().clamp(min=1e-12)
-        self.raw = nn.Parameter(rates / self.scale)
-
-    def forward(self) -> Tensor:
-        return self.raw * self.scale
 
 
 def fit_rates(
@@ -121,7 +117,7 @@ def fit_rates(
         Q [source, receiver] and tau of the smallest loss, and a report.
     """
     rest = torch.eye(len(basis), dtype=basis.dtype) - basis
-    module: nn.Module = (ConstrainedRates if settings.constraint == "exact" else FreeRates)(initial)
+    module = Rates(initial, settings.constraint == "exact")
     groups: list[dict[str, Any]] = [{"params": list(module.parameters())}]
     if delay is not None:
         log_delay = nn.Parameter(delay.log())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -287,12 +287,9 @@ def _combined(parts: Sequence[tuple[float, MasterEquation]], idle: float) -> Mem
     def joined(name: str) -> Tensor:
         return torch.cat([getattr(model, name) for _, model in models])
 
-    def summed(name: str) -> Tensor:
-        return torch.stack([weight * getattr(model, name) for weight, model in models]).sum(0)
-
-    basis = summed("basis")
+    rates, basis = (_summed((weight, getattr(model, name)) for weight, model in models) for name in ("rates", "basis"))
     return MemoryModel(
-        rates=summed("rates").detach(), basis=basis + idle * torch.eye(len(basis), dtype=basis.dtype),
+        rates=rates.detach(), basis=basis + idle * torch.eye(len(basis), dtype=basis.dtype),
         amplitudes=torch.cat([*single, *paired]),
         **{name: joined(name) for name in ("decay", "pair_decay", "pair_frequency")},
     )  # fmt: skip
@@ -303,7 +300,7 @@ def _combined_loss(losses: Sequence[tuple[float, Loss | None]]) -> Loss | None:
     held = [(weight, loss) for weight, loss in losses if loss is not None]
     if len(held) < len(losses):
         return None
-    rates = torch.stack([weight * torch.tensor(loss.rates, dtype=torch.float64) for weight, loss in held]).sum(0)
+    rates = _summed((weight, torch.tensor(loss.rates, dtype=torch.float64)) for weight, loss in held)
     return Loss(tuple(rates.clamp(min=0).tolist()), max(loss.misfit for _, loss in held))
 
 
@@ -315,14 +312,15 @@ def _combined_errors(parts: Sequence[tuple[float, MasterEquation]]) -> Uncertain
     times = held[0][1].times
     split = [(weight, *errors.parts(times)) for weight, errors in held]
 
-    def joined(values: list[Tensor]) -> Tensor:
-        return torch.stack([(w * v).square() for (w, _), v in zip(held, values, strict=True)]).sum(0).sqrt()
-
-    return of_parts(
-        joined([errors.rates_stderr for _, errors in held]),
-        joined([errors.basis_stderr for _, errors in held]),
-        times,
-        torch.stack([weight**2 * noise for weight, noise, _ in split]).sum(0),
-        torch.stack([weight * misfit.sqrt() for weight, _, misfit in split]).sum(0).square(),
-        held[0][1].alike,
+    rates, basis = (
+        _summed((1.0, (weight * getattr(errors, name)).square()) for weight, errors in held).sqrt()
+        for name in ("rates_stderr", "basis_stderr")
     )
+    by_noise = _summed((weight**2, noise) for weight, noise, _ in split)
+    by_misfit = _summed((weight, misfit.sqrt()) for weight, _, misfit in split).square()
+    return of_parts(rates, basis, times, by_noise, by_misfit, held[0][1].alike)
+
+
+def _summed(parts: Iterable[tuple[float, Tensor]]) -> Tensor:
+    """A weighted sum."""
+    return torch.stack([weight * value for weight, value in parts]).sum(0)

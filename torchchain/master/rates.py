@@ -86,14 +86,19 @@ class RateModel(TransferModel):
         """Largest row sum of Q, per unit time."""
         return float(self.rates.detach().sum(-1).abs().max())
 
+    def _moving(self) -> Tensor:
+        """The flow of the energy that moves, in one state of each band or more, without damping."""
+        return self.rates
+
     def embedding(self) -> Embedding:
-        """Free energy and basis energy side by side: (I - Pi, Pi) decaying by Q - D and -D."""
+        """Free energy in its states and basis energy side by side: (I - Pi, Pi) decaying by Q - D and -D."""
         eye = torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device)
-        drain = torch.diag(self.damping)
+        drain, moving = torch.diag(self.damping), self._moving()
+        states = len(moving) // len(eye)
         return Embedding(
-            torch.cat([eye - self.basis, self.basis], dim=1),
-            torch.block_diag(self.rates - drain, -drain),
-            torch.cat([eye, eye]),
+            torch.cat([eye - self.basis, *[torch.zeros_like(eye)] * (states - 1), self.basis], dim=1),
+            torch.block_diag(moving - torch.block_diag(*[drain] * states), -drain),
+            torch.cat([eye] * (states + 1)),
         )
 
     def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
@@ -140,15 +145,8 @@ class SwingInModel(RateModel):
     def n_parameters(self) -> int:
         return super().n_parameters + len(self.delay.unique())
 
-    def embedding(self) -> Embedding:
-        """Resting, moving and basis energy side by side."""
-        eye = torch.eye(self.n_bands, dtype=self.rates.dtype, device=self.rates.device)
-        drain = torch.diag(self.damping)
-        return Embedding(
-            torch.cat([eye - self.basis, torch.zeros_like(eye), self.basis], dim=1),
-            torch.block_diag(swing_in_generator(self.rates, self.delay) - torch.block_diag(drain, drain), -drain),
-            torch.cat([eye, eye, eye]),
-        )
+    def _moving(self) -> Tensor:
+        return swing_in_generator(self.rates, self.delay)
 
     def propagate(self, initial: Tensor, times: Tensor) -> Tensor:
         return TransferModel.propagate(self, initial, times)
