@@ -367,7 +367,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
     )
 
 
-SCRIPT = harness.Script("chart_evolvers", Config(), SMOKE, measure, draw, compare, explain)
+SCRIPT = harness.Script("chart_evolvers", Config(), SMOKE, measure, draw, compare, explain, pieces="waves")
 
 
 def main(arguments: list[str] | None = None) -> int:

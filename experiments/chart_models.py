@@ -246,7 +246,7 @@ def explain(data: xarray.Dataset, config: Config) -> str:
     return "\n".join(lines)
 
 
-SCRIPT = harness.Script("chart_models", Config(), SMOKE, measure, draw, compare, explain)
+SCRIPT = harness.Script("chart_models", Config(), SMOKE, measure, draw, compare, explain, pieces="bands")
 
 
 def main(arguments: list[str] | None = None) -> int:

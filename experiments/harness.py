@@ -97,6 +97,7 @@ class Script:
         draw: (data, config) to the figure, no computation.
         compare: (data, config) to the table.
         explain: (data, config) to what the table means, in words.
+        pieces: the setting, a list, by which a long run may be cut into several that are joined afterwards.
     """
 
     name: str
@@ -106,6 +107,7 @@ class Script:
     draw: Callable[[xarray.Dataset, Any], Figure]
     compare: Callable[[xarray.Dataset, Any], list[Row]]
     explain: Callable[[xarray.Dataset, Any], str]
+    pieces: str = ""
 
 
 def run(script: Script, arguments: Sequence[str] | None = None) -> int:
@@ -129,12 +131,16 @@ def run(script: Script, arguments: Sequence[str] | None = None) -> int:
 def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
     began, stages = time.time(), {}
     checks.device("device", flags.device)
-    data = script.measure(flags.settings, flags.device)
+    settings = flags.settings
+    if flags.join:
+        settings, data = _joined(script, flags.join)
+    else:
+        data = script.measure(settings, flags.device)
     stages["measure"] = time.time() - began
-    rows = script.compare(data, flags.settings)
-    figure, report = drawn(script, data, flags.settings), _report(script, data, flags.settings, rows)
+    rows = script.compare(data, settings)
+    figure, report = drawn(script, data, settings), _report(script, data, settings, rows)
     stages["figure and table"] = time.time() - began - stages["measure"]
-    config = _toml(flags.settings)
+    config = _toml(settings)
     outputs.write(
         out,
         {
@@ -144,12 +150,32 @@ def _run(script: Script, flags: Any, out: Path, arguments: list[str]) -> None:
             "report.txt": outputs.text(report),
             outputs.RECORD: outputs.reported(
                 out, arguments, config, flags.device, began, stages,
-                command=shlex.join(["python", f"experiments/{script.name}.py", *arguments]), seed=flags.settings.seed,
+                command=shlex.join(["python", f"experiments/{script.name}.py", *arguments]), seed=settings.seed,
             )[outputs.RECORD],
         },
     )  # fmt: skip
     print(report, end="")
     print(f"{time.time() - began:.1f} s, results in {out}")
+
+
+def _joined(script: Script, folders: Sequence[str]) -> tuple[Any, xarray.Dataset]:
+    """Settings and data of one run from those of its pieces, in their order."""
+    if not script.pieces:
+        raise checks.fail("join", f"be left out, as {script.name} is not run in pieces", ", ".join(folders))
+    found, parts = [], []
+    for folder in map(Path, folders):
+        found.append(read_toml(folder / "config.toml"))
+        with xarray.open_dataset(folder / "results.nc", engine="h5netcdf") as file:
+            parts.append(file.load())
+        if found[-1] | {script.pieces: []} != found[0] | {script.pieces: []}:
+            raise checks.fail("join", f"name runs that differ in {script.pieces} alone", str(folder))
+    settings = found[0] | {script.pieces: [piece for each in found for piece in each[script.pieces]]}
+    settings = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+    names = [name for name in parts[0].variables if not str(name).startswith("row_")]
+    data = {
+        name: (parts[0][name].dims, np.concatenate([part[name].values for part in parts]), parts[0][name].attrs) for name in names
+    }
+    return replace(script.config, **settings), xarray.Dataset(data, attrs=parts[0].attrs)
 
 
 def _redraw(script: Script, flags: Any, out: Path) -> None:
@@ -195,6 +221,7 @@ def _parse(script: Script, settings: Any, arguments: list[str]) -> Any:
             ("device", str, flag("cpu", "cpu, cuda, cuda:1, ...")),
             ("format", Literal["png", "pdf", "svg"], flag("png", "of the figure, besides PNG")),
             ("smoke", switch, flag(False, "few chains and short times: seconds")),
+            ("join", tuple[str, ...], flag((), "folders of runs of some pieces each, to be taken together instead of a run")),
             ("redraw", switch, flag(False, "figure and table from the data saved in --out, no run")),
         ],
         frozen=True,

@@ -20,6 +20,7 @@ from matplotlib.text import Text
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "experiments"))
 
+import chart_evolvers
 import chart_summary
 import error_bars
 import fig09
@@ -178,6 +179,22 @@ def test_redraw_keeps_the_settings(tmp_path, capsys):
     capsys.readouterr()
     assert fig12.main(["--redraw", "--seed", "7", *out]) == 2
     assert "seed must stay 0" in capsys.readouterr().err
+
+
+def test_runs_of_pieces_are_joined(tmp_path, capsys):
+    piece, whole = str(tmp_path / "piece"), str(tmp_path / "whole")
+    assert chart_evolvers.main(["--smoke", "--out", piece]) == 0
+    assert chart_evolvers.main(["--join", piece, piece, "--out", whole]) == 0
+    with xarray.open_dataset(f"{piece}/results.nc", engine="h5netcdf") as data:
+        runs = data.sizes["run"]
+    with xarray.open_dataset(f"{whole}/results.nc", engine="h5netcdf") as data:
+        assert (data.sizes["scene"], data.sizes["run"]) == (2, 2 * runs)
+    assert chart_evolvers.main(["--redraw", "--out", whole]) == 0  # with the settings of both
+    capsys.readouterr()
+    assert chart_evolvers.main(["--smoke", "--seed", "7", "--out", str(tmp_path / "other")]) == 0
+    assert chart_evolvers.main(["--join", piece, str(tmp_path / "other"), "--out", whole]) == 2
+    assert "join must name runs that differ in waves alone" in capsys.readouterr().err
+    assert fig12.main(["--join", piece, "--out", whole]) == 2
 
 
 def test_numbers_of_the_documents_are_stated_and_read(monkeypatch, tmp_path, capsys):
