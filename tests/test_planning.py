@@ -255,6 +255,23 @@ def test_hardly_any_disorder_asks_for_no_more_than_chains_all_the_same():
     assert first.tolerance == second.tolerance > second.predicted_error
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"n_particles": 16, "excitation": tc.StandingWave((7,), 0.2), "times": [0.18, 0.64, 1.25], "tolerance": 4e-5},
+        {"n_particles": 12, "excitation": tc.Impulse(5, 0.3), "times": [0.46, 0.84, 1.37], "tolerance": 3e-4},
+        {"n_particles": 8, "excitation": tc.StandingWave((2,), 0.05), "times": [0.2, 0.75, 2.07], "tolerance": 1.4e-7},
+    ],
+)
+def test_the_first_steps_keep_to_the_tolerance_too(fields):
+    # Energies swing with the first step, when phases are hardly off.
+    disorder = tc.Disorder("binary", 0.05)
+    wanted = tc.Scene(**fields, contact="hertz", disorder=disorder, realizations=3, observables=("total_energy", "energy"))
+    found, exact = tc.simulate(wanted), tc.simulate(wanted, "dopri8", options={"rtol": 1e-11, "atol": 1e-15})
+    for name in wanted.observables:
+        assert float(abs(found[name] - exact[name]).max()) <= wanted.tolerance * float(exact[name].max())
+
+
 def test_hertz_by_amplitude_has_no_bands():
     waves = tc.StandingWave(amplitude=0.5)
     wanted = scene(contact="auto", tolerance=1e-6, excitation=waves, observables=("band_energy",), n_bands=4)
