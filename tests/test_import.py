@@ -610,6 +610,8 @@ MISTAKES = [
     ("import RUN --reference {step}.dump", "reference must be a file name that holds no other braces"),
     ("import RUN --reference no.dump", "reference must be a file beside linear-1-1.dump.gz, got no file"),
     ("import RUN --boundary fixed", "boundary must be 'periodic' for wavenumber bands"),
+    ("import RUN --contact hertz", "contact must be left out for chains, whose bands are of linear contacts, got hertz"),
+    ("import RUN --largest 3", "largest must be left out for chains, whose bands have equal widths, got 3"),
     ("import RUN --n-bands 5", "n_bands must divide the number of tones n_particles/2 = 6, got 5"),
     ("import RUN --n-bands 0", "n_bands must be at least 1"),
     ("import RUN --n-bands 3", "linear-1-1.dump.gz: total energy must be positive"),

@@ -279,6 +279,10 @@ def _chains(flags: Import, files: list[RunFiles]) -> tuple[list[Frames], list[Ch
     if line_axis(frames[0].first, flags.axis) is None:
         how: dict[str, Any] = {"stiffness": stiffness, "contact": flags.contact, "damping": damping}
         return frames, [each.network(run.reference, **how) for run, each in zip(files, frames, strict=True)]
+    if flags.contact != "linear":
+        raise checks.fail("contact", "be left out for chains, whose bands are of linear contacts", flags.contact)
+    if flags.largest is not None:
+        raise checks.fail("largest", "be left out for chains, whose bands have equal widths", flags.largest)
     chains = []
     for run, each in zip(files, frames, strict=True):
         chains.append(each.chain(flags.boundary, stiffness, axis=flags.axis, damping=damping, reference=run.reference))
