@@ -13,7 +13,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import linear_weights
-from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping, checked_square
+from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping, checked_square, shaped
 from torchchain.master.projection import Order, Poles, Projection, search
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.sample import Sample, block_weights, exact_basis, leading_vectors
@@ -87,10 +87,9 @@ class MemoryModel(TransferModel):
                 raise checks.fail(name, "be one-dimensional", f"shape {tuple(value.shape)}")
             if name != "pair_frequency":
                 checks.first_bad(name, "not be negative", value, value < 0, "function")
-        shape = (len(decay) + 2 * len(pair_decay), *rates.shape)
-        if tuple(amplitudes.shape) != shape or pair_frequency.shape != pair_decay.shape:
-            raise checks.fail("amplitudes", f"have shape {shape}", f"shape {tuple(amplitudes.shape)}")
-        single = len(decay)
+        single, pairs = len(poles["decay"]), len(poles["pair_decay"])
+        shaped("pair_frequency", poles["pair_frequency"], (pairs,))
+        shaped("amplitudes", amplitudes, (single + 2 * pairs, *rates.shape))
         start = basis + amplitudes[:single].sum(0) + amplitudes[single::2].sum(0)
         identity = torch.eye(len(rates), dtype=start.dtype)
         checks.first_bad(
