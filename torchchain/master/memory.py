@@ -88,8 +88,8 @@ class MemoryModel(TransferModel):
             if name != "pair_frequency":
                 checks.first_bad(name, "not be negative", value, value < 0, "function")
         single, pairs = len(poles["decay"]), len(poles["pair_decay"])
-        shaped("pair_frequency", poles["pair_frequency"], (pairs,))
-        shaped("amplitudes", amplitudes, (single + 2 * pairs, *rates.shape))
+        shaped("pair_frequency", poles["pair_frequency"], (pairs,), " for pair_decay")
+        shaped("amplitudes", amplitudes, (single + 2 * pairs, *rates.shape), " for decay and pair_decay")
         start = basis + amplitudes[:single].sum(0) + amplitudes[single::2].sum(0)
         identity = torch.eye(len(rates), dtype=start.dtype)
         checks.first_bad(
