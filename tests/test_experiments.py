@@ -206,10 +206,10 @@ def test_numbers_of_the_documents_are_stated_and_read(monkeypatch, tmp_path, cap
     asked = []
     monkeypatch.setattr(readme_numbers, "made", lambda command, out, seed: asked.append((command, seed)) or out)
     table = [
-        readme_numbers.Number("91 of 100", "plan_grid", lambda out: 0.5, 0.4, 0.6, True, seeds=3),
-        readme_numbers.Number("91 of 100", "plan_grid", lambda out: 0.7, 0.4, 0.6, True),
+        readme_numbers.Number("of 100 varied scenes", "plan_grid", lambda out: 0.5, 0.4, 0.6, True, seeds=3),
+        readme_numbers.Number("of 100 varied scenes", "plan_grid", lambda out: 0.7, 0.4, 0.6, True),
         readme_numbers.Number("99 of 98", "plan_grid", lambda out: 0.5, 0.4, 0.6, True),
-        readme_numbers.Number("91 of 100", "growth", lambda out: 0.5, 0.4, 0.6),
+        readme_numbers.Number("of 100 varied scenes", "growth", lambda out: 0.5, 0.4, 0.6),
     ]
     monkeypatch.setattr(readme_numbers, "NUMBERS", table)
     assert readme_numbers.main(["--out", str(tmp_path)]) == 1
