@@ -85,35 +85,16 @@ def beside(work: Callable[[], Result], workers: int, at_once: bool = False) -> I
     if workers <= 1:
         yield work
         return
-    begin, wanted = threading.Event(), True
+    with _told(work, _waiting_for_core) as (begin, future):
 
-    def alone() -> Result:
-        begin.wait()
-        if not wanted:
-            raise CancelledError
-        return work()
+        def result() -> Result:
+            begin.set()
+            return future.result()
 
-    pool = ThreadPoolExecutor(1, thread_name_prefix="torchchain", initializer=partial(torch.set_num_threads, 1))
-    future = pool.submit(alone)
-
-    def result() -> Result:
-        begin.set()
-        return future.result()
-
-    if at_once:
-        begin.set()
-    _waiting_for_core.append(begin)
-    try:
+        if at_once:
+            begin.set()
         yield result
-    except BaseException:  # nobody wants what is under way
-        wanted = False
         begin.set()
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
-    finally:
-        _waiting_for_core.remove(begin)
-    begin.set()
-    pool.shutdown()
 
 
 def core_free() -> None:
@@ -132,26 +113,39 @@ def meanwhile(work: Callable[[], object], workers: int) -> Iterator[None]:
     if workers <= 1:
         yield
         return
-    under_way, wanted = threading.Event(), True
-
-    def alone() -> None:
-        under_way.wait()
-        if wanted:
-            torch.set_num_threads(1)
-            work()
-
-    thread = threading.Thread(target=alone, name="torchchain meanwhile", daemon=True)
-    thread.start()
-    _waiting.append(under_way)
-    try:
+    with _told(work, _waiting):
         yield
-        wanted = under_way.is_set()
-        under_way.set()
-        thread.join()
+
+
+@contextmanager
+def _told(
+    work: Callable[[], Result], waiting: list[threading.Event]
+) -> Iterator[tuple[threading.Event, Future[Result]]]:
+    """Do other work on a thread of its own once an event is set, which is among those ``waiting`` meanwhile; gives it and the result.
+
+    At the end what has begun is waited for, and what has not is not done, nor is anything waited for of what fails.
+    """
+    begin, wanted = threading.Event(), True
+
+    def alone() -> Result:
+        begin.wait()
+        if not wanted:
+            raise CancelledError
+        return work()
+
+    pool = ThreadPoolExecutor(1, thread_name_prefix="torchchain", initializer=partial(torch.set_num_threads, 1))
+    future = pool.submit(alone)
+    waiting.append(begin)
+    try:
+        yield begin, future
+        wanted = begin.is_set()
+        begin.set()
+        pool.shutdown()
     finally:  # of what failed nobody wants the rest
         wanted = False
-        under_way.set()
-        _waiting.remove(under_way)
+        begin.set()
+        waiting.remove(begin)
+        pool.shutdown(wait=False)
 
 
 def map_in_order(work: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:

@@ -159,7 +159,7 @@ class Chain(checks.Fields):
         """The displacement counted from where the chain has moved as a whole, the mean by mass, times a factor; between walls as it is."""
         mass = self.rigid_mass
         if not checks.is_transformed(mass) and bool(mass.isinf().all()):
-            return displacement * factor
+            return displacement if factor == 1 else displacement * factor
         moment = (self.align(self.masses, displacement) * displacement).sum(-1, keepdim=True)
         return torch.add(moment / self.align(mass[..., None] / -factor, displacement), displacement, alpha=factor)
 

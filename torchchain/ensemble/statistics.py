@@ -47,11 +47,11 @@ def total_variation(p: Tensor, q: Tensor) -> Tensor:
     """
     p, q = checks.real_tensor("p", p), checks.real_tensor("q", q)
     if p.ndim == 0 or q.ndim == 0 or p.shape[-1] != q.shape[-1]:
-        raise checks.fail("q", f"have the bands of p, shape {tuple(p.shape)}", f"shape {tuple(q.shape)}")
+        raise checks.fail("q", f"have the bands of p, shape {tuple(p.shape)}", q)
     try:
         distance = (p - q).abs().sum(-1) / 2
     except RuntimeError:
-        raise checks.fail("q", f"fit p of shape {tuple(p.shape)}", f"shape {tuple(q.shape)}") from None
+        raise checks.fail("q", f"fit p of shape {tuple(p.shape)}", q) from None
     return checks.finite("p - q", distance)
 
 

@@ -33,7 +33,7 @@ def start(chain: Chain, state: State, method: str, **options: Any) -> Advance:
     entry = chosen(METHODS, chain, state, method, options)
     n = chain.n_particles
     if state.displacement.shape[-1] != n:
-        raise checks.fail("state", f"have {n} particles like the chain", f"shape {tuple(state.displacement.shape)}")
+        raise checks.fail("state", f"have {n} particles like the chain", state.displacement)
     chain.align(chain.masses, state.displacement)
     if chain.boundary not in entry.boundaries:
         raise checks.fail("boundary", f"be {' or '.join(entry.boundaries)} for method '{method}'", repr(chain.boundary))

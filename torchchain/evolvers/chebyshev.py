@@ -116,7 +116,7 @@ def bounding_frequency(
             given = checks.real_tensor("bound", bound).to(device, torch.float64)
             checks.first_bad("bound", "be positive", given, given <= 0)
             if given.shape not in (torch.Size(), batch):
-                raise checks.fail("bound", f"be a number or have shape {tuple(batch)}", f"shape {tuple(given.shape)}")
+                raise checks.fail("bound", f"be a number or have shape {tuple(batch)}", given)
             squared = given.expand(batch)
             rule = f"not lie below the largest squared frequency ({kind}.squared_frequency_bound() never does)"
             checks.first_bad("bound", rule, squared, exceeded(squared), kind)
@@ -222,7 +222,9 @@ class CompiledAdvance:
         states = torch.stack([state.displacement.detach(), state.velocity.detach()], dim=-2)
         if frequency is None:
             squared, count = np.empty(len(masses)), len(masses)
-            side_by_side(lambda *rows: stencil.squared_bounds(*rows, masses, springs, chain.is_free, SWEEPS, squared), count)
+            side_by_side(
+                lambda *rows: stencil.squared_bounds(*rows, masses, springs, chain.is_free, SWEEPS, squared), count
+            )
             frequencies = rounded_up(np.sqrt(squared))
         else:
             frequencies = frequency.reshape(-1).numpy()

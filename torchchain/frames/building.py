@@ -180,7 +180,7 @@ def masses_of(frame: Frame, types: np.ndarray | None, file: File, options: dict[
         return {"masses": torch.tensor([known[int(kind)] for kind in types], dtype=torch.float64)}
     values = checks.real_tensor("masses", given).to(torch.float64)
     if values.ndim > 1 or (values.ndim == 1 and len(values) != n):
-        raise checks.fail("masses", f"be a number or {n} numbers, one for each id", f"shape {tuple(values.shape)}")
+        raise checks.fail("masses", f"be a number or {n} numbers, one for each id", values)
     checks.first_bad("masses", "be positive", values, values <= 0, "particle")
     return {"masses": values.expand(n).clone()}
 

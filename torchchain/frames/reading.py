@@ -271,7 +271,7 @@ class Frames:
                 raise checks.fail(
                     "chain",
                     f"have masses of shape {tuple(found.displacement.shape[1:])}",
-                    f"shape {tuple(chain.masses.shape)}",
+                    chain.masses,
                 )
             check_energy(self.name, chain, found)
             check_opening(self.name, chain, found)

@@ -158,7 +158,7 @@ class CompactModel(OddsModel):
             self._hold(**{name: value})
         loss = rates.new_zeros(n, 0) if loss is None else checks.real_tensor("loss", loss).to(rates)
         if loss.ndim != 2 or len(loss) != n:
-            raise checks.fail("loss", f"have shape ({n}, modes)", f"shape {tuple(loss.shape)}")
+            raise checks.fail("loss", f"have shape ({n}, modes)", loss)
         if loss.numel():
             checks.first_bad("loss", "not be negative", loss, loss < 0, "mode")
             total = loss.sum(-1)

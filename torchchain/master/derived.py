@@ -88,7 +88,7 @@ class TheoryModel(OddsModel):
             checks.real_tensor(n, v) for n, v in (("law_values", law_values), ("law_weights", law_weights))
         )
         if values.ndim != 1 or values.shape != weights.shape or not len(values):
-            raise checks.fail("law_weights", f"have shape {tuple(values.shape)}", f"shape {tuple(weights.shape)}")
+            raise checks.fail("law_weights", f"have shape {tuple(values.shape)}", weights)
         checks.first_bad("law_values", "be positive", values, ~(values > 0), "node")
         checks.first_bad("law_weights", "be positive", weights, ~(weights > 0), "node")
         if abs(float(weights.sum()) - 1) > 1e-4:

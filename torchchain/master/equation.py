@@ -252,7 +252,7 @@ class MasterEquation(Printed, nn.Module):
     def _initial(self, initial: Any) -> Tensor:
         initial = checks.real_tensor("initial", initial).to(self.rates)
         if initial.ndim == 0 or initial.shape[-1] != self.n_bands:
-            raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}")
+            raise checks.fail("initial", f"have {self.n_bands} bands on its last axis", initial)
         return initial
 
     def _supply(self, supply: Any, initial: Tensor, times: Tensor) -> Tensor:
@@ -261,11 +261,11 @@ class MasterEquation(Printed, nn.Module):
         if supply.ndim == 1:
             supply = supply[None]
         if supply.ndim == 0 or supply.shape[-1] != self.n_bands or supply.shape[-2] not in (1, len(times)):
-            raise checks.fail("supply", f"have shape {(self.n_bands,)} or (*batch, {shape[0]}, {shape[1]})", f"shape {tuple(supply.shape)}")  # fmt: skip
+            raise checks.fail("supply", f"have shape {(self.n_bands,)} or (*batch, {shape[0]}, {shape[1]})", supply)  # fmt: skip
         try:
             batch = np.broadcast_shapes(supply.shape[:-2], initial.shape[:-1])
         except ValueError:
-            raise checks.fail("supply", f"fit a batch of {tuple(initial.shape[:-1])} starts", f"shape {tuple(supply.shape)}") from None  # fmt: skip
+            raise checks.fail("supply", f"fit a batch of {tuple(initial.shape[:-1])} starts", supply) from None  # fmt: skip
         return supply.expand(*batch, *shape)
 
     def _doubts(

@@ -84,7 +84,7 @@ class MemoryModel(TransferModel):
         for name, value in poles.items():
             poles[name] = value = checks.real_tensor(name, value).to(rates)
             if value.ndim != 1:
-                raise checks.fail(name, "be one-dimensional", f"shape {tuple(value.shape)}")
+                raise checks.fail(name, "be one-dimensional", value)
             if name != "pair_frequency":
                 checks.first_bad(name, "not be negative", value, value < 0, "function")
         single, pairs = len(poles["decay"]), len(poles["pair_decay"])

@@ -127,7 +127,7 @@ def shaped(name: str, value: Tensor, shape: tuple[int, ...], like: str = "") -> 
     """A real tensor of this shape, which is that ``like`` something."""
     value = checks.real_tensor(name, value)
     if tuple(value.shape) != shape:
-        raise checks.fail(name, f"have shape {shape}{like}", f"shape {tuple(value.shape)}")
+        raise checks.fail(name, f"have shape {shape}{like}", value)
     return value
 
 
@@ -135,7 +135,7 @@ def checked_square(rates: Tensor) -> Tensor:
     """Rates [source, receiver]."""
     rates = checks.real_tensor("rates", rates)
     if rates.ndim != 2 or rates.shape[0] != rates.shape[1] or not rates.numel():
-        raise checks.fail("rates", "be a square matrix", f"shape {tuple(rates.shape)}")
+        raise checks.fail("rates", "be a square matrix", rates)
     return rates
 
 

@@ -137,7 +137,7 @@ class SwingInModel(RateModel):
         super().__init__(rates, basis, damping)
         delay = checks.real_tensor("delay", delay).to(self.rates)
         if delay.ndim > 1 or delay.numel() not in (1, self.n_bands):
-            raise checks.fail("delay", f"be a number or have shape ({self.n_bands},)", f"shape {tuple(delay.shape)}")
+            raise checks.fail("delay", f"be a number or have shape ({self.n_bands},)", delay)
         checks.first_bad("delay", "be positive", delay, delay <= 0, "band")
         self._hold(delay=delay.reshape(-1).expand(self.n_bands).contiguous())
 

@@ -72,7 +72,7 @@ class NonlinearMasterEquation:
         for name, shape in (("spectrum", wanted), ("shapes", wanted[::-1])):
             value = checks.real_tensor(name, getattr(self, name)).to(torch.float64)
             if tuple(value.shape) != shape:
-                raise checks.fail(name, f"have shape {shape}", f"shape {tuple(value.shape)}")
+                raise checks.fail(name, f"have shape {shape}", value)
             off = (value.sum(-1) - 1).abs() > 1e-6
             checks.first_bad(name, "have rows of sum 1", value.sum(-1), off, "row")
             object.__setattr__(self, name, value)
@@ -103,9 +103,7 @@ class NonlinearMasterEquation:
         moved = self.linear.transfer(times)
         start = checks.real_tensor("initial", initial).to(self.spectrum)
         if start.ndim == 0 or start.shape[-1] != self.linear.n_bands:
-            raise checks.fail(
-                "initial", f"have {self.linear.n_bands} bands on its last axis", f"shape {tuple(start.shape)}"
-            )
+            raise checks.fail("initial", f"have {self.linear.n_bands} bands on its last axis", start)
         return self.joined(start, moved, times, energy_per_particle, **options)
 
     def joined(self, start: Tensor, moved: Tensor, times: Any, energy_per_particle: float, **options: Any) -> Tensor:

@@ -142,7 +142,7 @@ def _checked_starts(starts: Any, bands: FrequencyBands) -> Tensor:
         return torch.stack([*one, *pairs])
     shares = checks.real_tensor("starts", starts).to(torch.float64)
     if shares.ndim != 2 or shares.shape[1] != bands.n_bands or not len(shares):
-        raise checks.fail("starts", f"have shape (start, {bands.n_bands})", f"shape {tuple(shares.shape)}")
+        raise checks.fail("starts", f"have shape (start, {bands.n_bands})", shares)
     checks.first_bad("starts", "not be negative", shares, shares < 0, "band")
     off = (shares.sum(1) - 1).abs() > 1e-9
     checks.first_bad("starts", "have rows of sum 1", shares.sum(1), off, "start")

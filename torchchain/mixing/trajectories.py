@@ -62,7 +62,7 @@ class TrajectoryLoss:
         energies = checks.real_tensor("energies", energies).double()
         if energies.ndim != 3 or tuple(energies.shape[1:]) != (len(self.times), linear.n_bands) or not len(energies):
             rule = f"have shape (start, {len(self.times)}, {linear.n_bands})"
-            raise checks.fail("energies", rule, f"shape {tuple(energies.shape)}")
+            raise checks.fail("energies", rule, energies)
         total = energies[:, 0].sum(-1)
         checks.first_bad("energies", "not be zero at time 0", total, ~(total > 0), "start")
         self.start, self.total = energies[:, 0].clamp(min=0), total[:, None, None]
@@ -71,7 +71,7 @@ class TrajectoryLoss:
         if stderr is not None:
             given = checks.real_tensor("stderr", stderr).double()
             if given.shape != energies.shape:
-                raise checks.fail("stderr", f"have shape {tuple(energies.shape)}", f"shape {tuple(given.shape)}")
+                raise checks.fail("stderr", f"have shape {tuple(energies.shape)}", given)
             checks.first_bad("stderr", "not be negative", given, given < 0, "band")
             error = given[:, 1:] / self.total
         self.weight = 1 / (error + CLOSURE)

@@ -65,7 +65,7 @@ class TriadModel(nn.Module):
         coupling = checks.real_tensor("coupling", coupling).to(torch.float64)
         for name, value, size in (("density", density, bands.n_bands), ("coupling", coupling, len(triads))):
             if tuple(value.shape) != (size,):
-                raise checks.fail(name, f"have shape ({size},)", f"shape {tuple(value.shape)}")
+                raise checks.fail(name, f"have shape ({size},)", value)
         checks.first_bad("density", "be positive", density, density <= 0, "band")
         checks.first_bad("coupling", "not be negative", coupling, coupling < 0, "triad")
         self.bands = bands
@@ -117,9 +117,7 @@ class TriadModel(nn.Module):
         checks.choice("method", method, adaptive)
         initial = checks.real_tensor("initial", initial).to(self.density)
         if initial.ndim == 0 or initial.shape[-1] != self.bands.n_bands:
-            raise checks.fail(
-                "initial", f"have {self.bands.n_bands} bands on its last axis", f"shape {tuple(initial.shape)}"
-            )
+            raise checks.fail("initial", f"have {self.bands.n_bands} bands on its last axis", initial)
         checks.first_bad("initial", "not be negative", initial, initial < 0, "band")
         times = checks.times("times", times).to(self.density)
         rtol = checks.number("rtol", rtol, above=0, below=1)

@@ -18,7 +18,7 @@ def checked_box(value: Any, positions: Tensor) -> Tensor:
     if box.ndim == 0:
         raise checks.FieldTypeError(f"box must be None or have shape ({d},) or ({d}, {d}), got {value!r}")
     if tuple(box.shape) not in ((d,), (d, d)):
-        raise checks.fail("box", f"have shape ({d},) or ({d}, {d})", f"shape {tuple(box.shape)}")
+        raise checks.fail("box", f"have shape ({d},) or ({d}, {d})", box)
     if box.ndim == 1:
         checks.first_bad("box", "be positive", box, ~(box > 0), "direction")
         return box
@@ -39,7 +39,7 @@ def checked_bonds(
     if bonds.is_floating_point() or bonds.is_complex() or bonds.dtype == torch.bool:
         raise checks.FieldTypeError(f"bonds must be integers, got {bonds.dtype}")
     if bonds.ndim != 2 or bonds.shape[1] != 2:
-        raise checks.fail("bonds", "have shape (bond, 2)", f"shape {tuple(bonds.shape)}")
+        raise checks.fail("bonds", "have shape (bond, 2)", bonds)
     bonds = bonds.to(positions.device, torch.int64)
     top = n + n_anchors
     more = f" and anchors {n} to {top - 1}" if top > n else ""

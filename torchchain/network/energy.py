@@ -122,9 +122,7 @@ def distances(network: Network, origin: int | Any) -> Tensor:
     else:
         point = checks.real_tensor("origin", origin).to(network.positions)
         if tuple(point.shape) != (network.dimension,):
-            raise checks.fail(
-                "origin", f"be a particle or {network.dimension} coordinates", f"shape {tuple(point.shape)}"
-            )
+            raise checks.fail("origin", f"be a particle or {network.dimension} coordinates", point)
     return network.nearest_image(network.positions - point).square().sum(-1).sqrt()
 
 

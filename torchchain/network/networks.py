@@ -76,7 +76,7 @@ class Network:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
         masses = checks.real_tensor("masses", self.masses)
         if masses.ndim == 0 or masses.shape[-1] < 1:
-            raise checks.fail("masses", "hold particles on the last axis", f"shape {tuple(masses.shape)}")
+            raise checks.fail("masses", "hold particles on the last axis", masses)
         checks.first_bad("masses", "be positive", masses, masses <= 0, "particle")
         put("masses", masses)
         positions = checks.real_tensor("positions", self.positions).to(masses)
@@ -85,7 +85,7 @@ class Network:
             raise checks.fail(
                 "positions",
                 f"have shape ({n}, 1), ({n}, 2) or ({n}, 3) like the masses",
-                f"shape {tuple(positions.shape)}",
+                positions,
             )
         put("positions", positions)
         checks.choice("motion", self.motion, MOTIONS)
@@ -93,7 +93,7 @@ class Network:
         if self.anchors is not None:
             anchors = checks.real_tensor("anchors", self.anchors).to(masses)
             if anchors.ndim != 2 or anchors.shape[1] != self.dimension:
-                raise checks.fail("anchors", f"have shape (anchor, {self.dimension})", f"shape {tuple(anchors.shape)}")
+                raise checks.fail("anchors", f"have shape (anchor, {self.dimension})", anchors)
             put("anchors", anchors)
         found, images = bonds.checked_bonds(self.bonds, self.images, n, self.n_anchors, positions, self.box is not None)
         put("bonds", found)
@@ -133,7 +133,7 @@ class Network:
         if value.ndim == 0:
             return value.expand(self.n_bonds)
         if tuple(value.shape) not in (shape, shape[-1:]):
-            raise checks.fail(name, f"be a number or have shape {shape[-1:]} or {shape}", f"shape {tuple(value.shape)}")
+            raise checks.fail(name, f"be a number or have shape {shape[-1:]} or {shape}", value)
         return value
 
     @property
@@ -223,7 +223,7 @@ class Network:
             raise checks.fail(
                 "state",
                 f"have leading axes {tuple(self.batch_shape)} like the network's masses",
-                f"shape {tuple(field.shape)}",
+                field,
             )
         middle = field.ndim - batch - 2
         return values.reshape(*values.shape[:-1], *[1] * (middle if values.ndim > 1 else 0), values.shape[-1], 1)
@@ -235,7 +235,7 @@ class Network:
             raise checks.fail(
                 "state",
                 f"have shape (*batch, {expected[0]}, {expected[1]}), particles and components of the network",
-                f"shape {tuple(displacement.shape)}",
+                displacement,
             )
         self.align(self.masses, displacement)
 

@@ -97,9 +97,7 @@ def packing(
     checks.truth("prestress", prestress)
     bare = Network(masses, positions, torch.zeros((0, 2), dtype=torch.int64), box=box)  # checks all but the radii
     if tuple(radii.shape) != (bare.n_particles,):
-        raise checks.fail(
-            "radii", f"have shape ({bare.n_particles},) like the particles", f"shape {tuple(radii.shape)}"
-        )
+        raise checks.fail("radii", f"have shape ({bare.n_particles},) like the particles", radii)
     checks.first_bad("radii", "be positive", radii, radii <= 0, "particle")
     bonds, images = near_pairs(positions, radii, bare.box)
     made = Packing(

@@ -40,6 +40,6 @@ def check_trajectory(network: Network, trajectory: Trajectory) -> tuple[Tensor, 
         raise checks.fail(
             "trajectory",
             "have the axes (*batch, time, particle, component)",
-            f"shape {tuple(trajectory.displacement.shape)}",
+            trajectory.displacement,
         )
     return trajectory.displacement, trajectory.velocity

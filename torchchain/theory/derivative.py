@@ -53,7 +53,7 @@ def transfer_at(
     damping = torch.as_tensor(damping, dtype=torch.float64)
     for name, value in (("strength", strength), ("damping", damping)):
         if value.ndim:
-            raise checks.fail(name, "be a scalar", f"shape {tuple(value.shape)}")
+            raise checks.fail(name, "be a scalar", value)
 
     disorder = Disorder(kind=kind, strength=float(strength.detach()), lower=lower)
     times = checks.times("times", times).to(torch.float64)

@@ -76,7 +76,7 @@ def law_of(disorder: Disorder, nodes: int = 48, strength: Tensor | None = None) 
     if strength is not None:
         checks.instance("strength", strength, Tensor)
         if strength.ndim:
-            raise checks.fail("strength", "be a scalar", f"shape {tuple(strength.shape)}")
+            raise checks.fail("strength", "be a scalar", strength)
         disorder = replace(disorder, strength=float(strength.detach()))
     values, weights = _fine_rule(disorder)
     if len(values) > nodes:

@@ -120,7 +120,7 @@ def effective_medium(
     checks.instance("disorder", disorder, Disorder)
     w = checks.real_tensor("frequencies", frequencies).to(torch.float64)
     if w.ndim != 1:
-        raise checks.fail("frequencies", "be one-dimensional", f"shape {tuple(w.shape)}")
+        raise checks.fail("frequencies", "be one-dimensional", w)
     checks.first_bad("frequencies", "be positive", w, w <= 0)
     if n_particles is not None:
         n_particles = checks.integer("n_particles", n_particles, 2)
