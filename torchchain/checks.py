@@ -182,6 +182,14 @@ def real_tensor(field: str, value: Any) -> Tensor:
     return value
 
 
+def shaped(field: str, value: Any, shape: tuple[int, ...], like: str = "") -> Tensor:
+    """The value as by :func:`real_tensor`, if it is of this shape, which is that ``like`` something."""
+    value = real_tensor(field, value)
+    if tuple(value.shape) != shape:
+        raise fail(field, f"have shape {shape}{like}", value)
+    return value
+
+
 def is_transformed(values: Tensor) -> bool:
     """Whether ``torch.func.grad`` or ``vmap`` traces the tensor: its values are not to be looked at, and pass all checks."""
     try:

@@ -67,10 +67,8 @@ def from_energies(
         energies = as_shares(times, energies)
     provenance = of_energies(provenance, times, energies)
     if starts is not None:
-        starts = checks.real_tensor("starts", starts).detach().cpu().double()
         expected = (*energies.shape[:2], energies.shape[3])
-        if tuple(starts.shape) != expected:
-            raise checks.fail("starts", f"have shape {expected}", starts)
+        starts = checks.shaped("starts", starts, expected).detach().cpu().double()
         checks.first_bad("starts", "not be negative by more than a tenth", starts, starts < -0.1, "realization")
         late = None if long_time is None else checks.real_tensor("long_time", long_time).cpu().double()
         per_run = late is not None and late.ndim == 3

@@ -25,7 +25,7 @@ from torchchain import checks
 from torchchain.master.certificate import CertificateError
 from torchchain.master.loss import frequencies, mode_energy
 from torchchain.master.memory import ORDERS, MemoryModel, checked_order, fit_memory
-from torchchain.master.model import Embedding, TransferModel, checked_square, shaped
+from torchchain.master.model import Embedding, TransferModel, checked_square
 from torchchain.master.nonnegative import nonnegative
 from torchchain.master.polynomials import checked_degrees, factors, n_coefficients, shapes
 from torchchain.master.proof import Certificate
@@ -150,7 +150,7 @@ class CompactModel(OddsModel):
             "coefficients": (coefficients, (n_coefficients(self.degrees_),)),
         }  # fmt: skip
         for name, (value, shape) in found.items():
-            value = shaped(name, value, shape).to(rates)
+            value = checks.shaped(name, value, shape).to(rates)
             if 0 in shape:
                 raise checks.fail(name, "hold a tone", f"shape {shape}")
             if name != "coefficients":
@@ -169,7 +169,7 @@ class CompactModel(OddsModel):
         if damping.ndim or bool(damping < 0) or bool(damping > 0) != bool(loss.numel()):
             raise checks.fail("contact_damping", "be a number, above 0 with a loss and 0 without", damping.tolist())
         size = (0,) if guide is None or not guide.numel() else tuple(self.coefficients.shape)
-        guide = shaped("guide", rates.new_zeros(0) if guide is None else guide, size)
+        guide = checks.shaped("guide", rates.new_zeros(0) if guide is None else guide, size)
         self._hold(_rates=rates, guide=guide.to(rates), loss=loss, contact_damping=damping.to(rates))
         self._parts = shapes(self.waves.distances, self.degrees_)  # not part of the file: they follow from the waves
 

@@ -28,7 +28,7 @@ from torchchain.master.compact import OddsModel
 from torchchain.master.compact_record import WINDOWS, CompactReport, CompactSettings, drawn_again, rungs_of
 from torchchain.master.fits import linear_weights
 from torchchain.master.logistic import BEYOND, Regression, fit_points, solve, stepped
-from torchchain.master.model import TransferModel, shaped
+from torchchain.master.model import TransferModel
 from torchchain.master.polynomials import checked_degrees, factors, n_coefficients, shapes
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.ringing import Degrees, Ringing, RingingRegression, checked_ringing, size_of, smooth_of
@@ -102,7 +102,7 @@ class TheoryModel(OddsModel):
         check = checked_ringing if len(degrees) == 5 else checked_degrees
         self.degrees_ = None if len(degrees) == 1 else check([int(degree) for degree in degrees])
         size = 0 if self.degrees_ is None else size_of(self.degrees_)
-        self._hold(coefficients=shaped("coefficients", coefficients, (size,)))
+        self._hold(coefficients=checks.shaped("coefficients", coefficients, (size,)))
         self.ring = Ring(
             tuple(values.double().tolist()), tuple(weights.double().tolist()), n, bands, numbers,
             bool(float(dual)), loss,

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchchain import checks
 from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.fits import linear_weights
-from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping, checked_square, shaped
+from torchchain.master.model import Embedding, TransferModel, checked_basis, checked_damping, checked_square
 from torchchain.master.projection import Order, Poles, Projection, search
 from torchchain.master.records import Fit, Fitted, Progress, Recipe, ReducedModel
 from torchchain.master.sample import Sample, block_weights, exact_basis, leading_vectors
@@ -88,8 +88,8 @@ class MemoryModel(TransferModel):
             if name != "pair_frequency":
                 checks.first_bad(name, "not be negative", value, value < 0, "function")
         single, pairs = len(poles["decay"]), len(poles["pair_decay"])
-        shaped("pair_frequency", poles["pair_frequency"], (pairs,), " for pair_decay")
-        shaped("amplitudes", amplitudes, (single + 2 * pairs, *rates.shape), " for decay and pair_decay")
+        checks.shaped("pair_frequency", poles["pair_frequency"], (pairs,), " for pair_decay")
+        checks.shaped("amplitudes", amplitudes, (single + 2 * pairs, *rates.shape), " for decay and pair_decay")
         start = basis + amplitudes[:single].sum(0) + amplitudes[single::2].sum(0)
         identity = torch.eye(len(rates), dtype=start.dtype)
         checks.first_bad(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchchain.master.model import shaped
+from torchchain import checks
 
 TIMES, BANDS = 2, 2
 """Neighbors on either side over which the model's error is averaged."""
@@ -28,7 +28,7 @@ def model_error(predicted: Tensor, mean: Tensor, stderr: Tensor, noise: Tensor) 
             has followed that noise.
     """
     for name, value in (("mean", mean), ("stderr", stderr), ("noise", noise)):
-        shaped(name, value, tuple(predicted.shape))
+        checks.shaped(name, value, tuple(predicted.shape))
     variance = stderr.square()
     told = variance > ROUNDING**2
     unit = torch.where(told, variance, torch.ones_like(variance))

@@ -123,14 +123,6 @@ class TransferModel(nn.Module):
         return self.propagate(torch.eye(self.n_bands).to(self.basis), times)
 
 
-def shaped(name: str, value: Tensor, shape: tuple[int, ...], like: str = "") -> Tensor:
-    """A real tensor of this shape, which is that ``like`` something."""
-    value = checks.real_tensor(name, value)
-    if tuple(value.shape) != shape:
-        raise checks.fail(name, f"have shape {shape}{like}", value)
-    return value
-
-
 def checked_square(rates: Tensor) -> Tensor:
     """Rates [source, receiver]."""
     rates = checks.real_tensor("rates", rates)
@@ -142,7 +134,9 @@ def checked_square(rates: Tensor) -> Tensor:
 def checked_basis(basis: Tensor, rates: Tensor) -> Tensor:
     """Pi [source, receiver] from itself or its diagonal, checked against the rates."""
     basis = checks.real_tensor("basis", basis)
-    basis = shaped("basis", torch.diag(basis) if basis.ndim == 1 else basis, tuple(rates.shape), " like the rates")
+    basis = checks.shaped(
+        "basis", torch.diag(basis) if basis.ndim == 1 else basis, tuple(rates.shape), " like the rates"
+    )
     total = basis.sum(-1)
     checks.first_bad("basis", "have row sums of at most 1", total, total > 1 + 1e-6, "band")
     return basis.to(rates)
@@ -151,7 +145,7 @@ def checked_basis(basis: Tensor, rates: Tensor) -> Tensor:
 def checked_damping(damping: Tensor | None, rates: Tensor) -> Tensor:
     """d [band], zero if None, checked against the rates."""
     damping = torch.zeros_like(rates[0]) if damping is None else damping
-    damping = shaped("damping", damping, (len(rates),), " like the rates")
+    damping = checks.shaped("damping", damping, (len(rates),), " like the rates")
     checks.first_bad("damping", "not be negative", damping, damping < 0, "band")
     return damping.to(rates)
 

@@ -30,7 +30,6 @@ from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.alike import variance
 from torchchain.master.logistic import BEYOND, chosen_times, solve
 from torchchain.master.misfit import model_error
-from torchchain.master.model import shaped
 from torchchain.master.polynomials import checked_degrees, n_coefficients
 from torchchain.master.tones import ONSET, ToneRegression, Tones, shares
 from torchchain.master.uncertainty import Uncertainty, interpolated
@@ -110,7 +109,7 @@ class StartModel(nn.Module):
             "stderr": (coupling.new_zeros(2, n_bands, 0, n_bands) if stderr is None else stderr, (2, n_bands, 0 if stderr is None else len(scale_times), n_bands)),
         }  # fmt: skip
         for name, (value, shape) in shapes.items():
-            value = shaped(f"starts.{name}", value, shape).double()
+            value = checks.shaped(f"starts.{name}", value, shape).double()
             if name in ("frequency", "decay", "coupling"):
                 checks.first_bad(f"starts.{name}", "be positive", value, ~(value > 0), "tone")
             if name in self.SHARES and not (float(value) >= 0 and (name == "onset" or float(value) <= 0.25)):

@@ -24,7 +24,7 @@ from torchchain.ensemble.transfer import BandTransfer
 from torchchain.master.alike import factors, group_of, variance
 from torchchain.master.fits import FitWarning
 from torchchain.master.misfit import model_error
-from torchchain.master.model import TransferModel, shaped
+from torchchain.master.model import TransferModel
 from torchchain.master.records import Progress, Recipe
 from torchchain.master.sample import Sample, block_weights
 
@@ -140,7 +140,7 @@ class Uncertainty:
             **({} if alike is None else {"alike": (alike, (len(alike), n, int(group_of(count)[-1]) + 1, n))}),
         }  # fmt: skip
         for name, (value, shape) in every.items():
-            shaped(name, value, shape)
+            checks.shaped(name, value, shape)
             if name != "alike":
                 checks.first_bad(name, "not be negative", value, value < 0)
             else:
@@ -291,7 +291,9 @@ def kept_times(times: Tensor, most: int = MOST_TIMES) -> Tensor:
 def later_times(end: float) -> Tensor:
     """Times beyond the last at which :func:`horizon` looks, (48,): 24 up to twice that, and two in every octave from there."""
     octaves = 2.0 ** torch.arange(1, OCTAVES + 1, dtype=torch.float64)
-    return end * torch.cat([torch.linspace(1, 2, 24, dtype=torch.float64), torch.stack([1.5 * octaves, 2 * octaves], 1).flatten()])
+    return end * torch.cat(
+        [torch.linspace(1, 2, 24, dtype=torch.float64), torch.stack([1.5 * octaves, 2 * octaves], 1).flatten()]
+    )
 
 
 def horizon(transfer: BandTransfer, model: TransferModel) -> float:

@@ -70,9 +70,7 @@ class NonlinearMasterEquation:
         checks.instance("triads", self.triads, TriadModel)
         wanted = (self.linear.n_bands, self.triads.bands.n_bands)
         for name, shape in (("spectrum", wanted), ("shapes", wanted[::-1])):
-            value = checks.real_tensor(name, getattr(self, name)).to(torch.float64)
-            if tuple(value.shape) != shape:
-                raise checks.fail(name, f"have shape {shape}", value)
+            value = checks.shaped(name, getattr(self, name), shape).to(torch.float64)
             off = (value.sum(-1) - 1).abs() > 1e-6
             checks.first_bad(name, "have rows of sum 1", value.sum(-1), off, "row")
             object.__setattr__(self, name, value)

@@ -69,9 +69,7 @@ class TrajectoryLoss:
         self.measured = energies[:, 1:] / self.total
         error = torch.zeros_like(self.measured)
         if stderr is not None:
-            given = checks.real_tensor("stderr", stderr).double()
-            if given.shape != energies.shape:
-                raise checks.fail("stderr", f"have shape {tuple(energies.shape)}", given)
+            given = checks.shaped("stderr", stderr, tuple(energies.shape)).double()
             checks.first_bad("stderr", "not be negative", given, given < 0, "band")
             error = given[:, 1:] / self.total
         self.weight = 1 / (error + CLOSURE)

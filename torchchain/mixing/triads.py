@@ -61,11 +61,8 @@ class TriadModel(nn.Module):
         super().__init__()
         checks.instance("bands", bands, FrequencyBands)
         triads, frequencies = triads_of(bands)
-        density = checks.real_tensor("density", density).to(torch.float64)
-        coupling = checks.real_tensor("coupling", coupling).to(torch.float64)
-        for name, value, size in (("density", density, bands.n_bands), ("coupling", coupling, len(triads))):
-            if tuple(value.shape) != (size,):
-                raise checks.fail(name, f"have shape ({size},)", value)
+        density = checks.shaped("density", density, (bands.n_bands,)).to(torch.float64)
+        coupling = checks.shaped("coupling", coupling, (len(triads),)).to(torch.float64)
         checks.first_bad("density", "be positive", density, density <= 0, "band")
         checks.first_bad("coupling", "not be negative", coupling, coupling < 0, "triad")
         self.bands = bands
